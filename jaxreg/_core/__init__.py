@@ -1,0 +1,1 @@
+"""Vocabulary, statuses and checks that every other room of the package uses."""

@@ -1,0 +1,90 @@
+"""Checks of arguments while tracing: they raise and name what was found and wanted."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxreg._core.typing import Key
+
+
+def as_float_array(x: object, name: str) -> Array:
+    """Converts what `numpy.asarray` or DLPack takes to a float32 or float64 array.
+
+    Integers become the default float type; half precision, complex numbers and
+    anything that is not a number are refused.
+
+    Args:
+        x: an array of any library, nested lists, or a JAX array (also a tracer).
+        name: how error messages call the argument.
+    """
+    if not isinstance(x, jax.Array):
+        if hasattr(x, "__dlpack__") and not isinstance(x, np.ndarray):
+            x = np.from_dlpack(x)  # pyright: ignore[reportArgumentType]
+        try:
+            x = np.asarray(x)
+        except ValueError as err:
+            raise ValueError(f"{name}: not a rectangular array of numbers.") from err
+        if x.dtype == object or x.dtype.kind in "SUV":
+            raise TypeError(f"{name}: wanted numbers, found dtype {x.dtype}.")
+        if x.dtype == np.float64 and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+            x = x.astype(np.float32)
+    out = jnp.asarray(x)
+    if jnp.issubdtype(out.dtype, jnp.integer):
+        return out.astype(jnp.result_type(float))
+    if out.dtype not in (jnp.float32, jnp.float64):
+        raise TypeError(f"{name}: wanted float32 or float64, found {out.dtype}.")
+    return out
+
+
+def check_points(points: Array, name: str) -> int:
+    """Requires `(..., n, d)` with d = 2 or 3 and n >= 1; returns d."""
+    if points.ndim < 2 or points.shape[-1] not in (2, 3):
+        raise ValueError(
+            f"{name}: wanted shape (n, 2) or (n, 3) with leading batch axes at most, "
+            f"found {points.shape}."
+        )
+    if points.shape[-2] == 0:
+        raise ValueError(f"{name}: holds no points, found shape {points.shape}.")
+    return points.shape[-1]
+
+
+def check_mask(mask: object, shape: tuple[int, ...], name: str) -> Array:
+    """Returns a boolean mask of `shape`; None stands for everything valid."""
+    if mask is None:
+        return jnp.ones(shape, dtype=bool)
+    out = jnp.asarray(mask)
+    if out.dtype != bool:
+        raise TypeError(f"{name}: wanted a boolean mask, found dtype {out.dtype}.")
+    if out.shape != shape:
+        raise ValueError(f"{name}: wanted shape {shape}, found {out.shape}.")
+    return out
+
+
+def check_motion(T: Array, d: int, name: str) -> None:
+    """Requires homogeneous matrices `(..., d+1, d+1)`."""
+    if T.ndim < 2 or T.shape[-2:] != (d + 1, d + 1):
+        raise ValueError(
+            f"{name}: wanted homogeneous matrices of shape (..., {d + 1}, {d + 1}), "
+            f"found {T.shape}."
+        )
+
+
+def check_key(key: Key | None, name: str = "key") -> Key:
+    """Requires a PRNG key of `jax.random.key` (or the older `PRNGKey`)."""
+    if key is None:
+        raise ValueError(
+            f"{name}: this method draws random numbers; pass key=jax.random.key(seed)."
+        )
+    if not isinstance(key, jax.Array):
+        raise TypeError(
+            f"{name}: wanted jax.random.key(seed), found {type(key).__name__}."
+        )
+    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        return key
+    if key.dtype == jnp.uint32 and key.shape[-1:] == (2,):
+        return jax.random.wrap_key_data(key)
+    raise TypeError(
+        f"{name}: wanted jax.random.key(seed), found an array of dtype {key.dtype} "
+        f"and shape {key.shape}."
+    )

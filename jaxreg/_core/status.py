@@ -1,0 +1,59 @@
+"""What became of a numerical problem, as a value that lives in an array.
+
+A Solution holds its status as an int32 array, so that it passes through `jit`, `vmap`
+and pickling and keeps one status per lane. `Status(int(sol.status)).advice` says what
+happened and what to change.
+"""
+
+import enum
+
+
+class Status(enum.IntEnum):
+    """The outcome of a solve. Compare with `sol.status == Status.CONVERGED`."""
+
+    CONVERGED = 0
+    MAX_STEPS = 1
+    DEGENERATE = 2
+    TOO_FEW_POINTS = 3
+    NON_FINITE = 4
+    LOW_OVERLAP = 5
+    AMBIGUOUS = 6
+    DISCONNECTED = 7
+
+    @property
+    def advice(self) -> str:
+        """What happened, why that is likely, and what to change."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.CONVERGED: "Converged.",
+    Status.MAX_STEPS: (
+        "The steps ran out before the answer stood still. Raise max_steps, or start "
+        "nearer to the solution."
+    ),
+    Status.DEGENERATE: (
+        "The data leave some direction of the motion free (points on a line or a "
+        "plane, a rotationally symmetric shape). Use more or other points."
+    ),
+    Status.TOO_FEW_POINTS: (
+        "Fewer valid distinct points than d + 1. Check the file, the mask, and the "
+        "voxel size if the cloud was thinned."
+    ),
+    Status.NON_FINITE: (
+        "A number overflowed or was not finite in the input. Mask rows with NaN or "
+        "inf, and check the unit of the coordinates."
+    ),
+    Status.LOW_OVERLAP: (
+        "No pose was found at which enough of the two point sets agree. They may not "
+        "overlap; else raise the number of particles or give an initial guess."
+    ),
+    Status.AMBIGUOUS: (
+        "Several poses agree about equally well (a symmetric object?). See the modes "
+        "of the solution, or give an initial guess."
+    ),
+    Status.DISCONNECTED: (
+        "The trusted edges do not reach every pose. See `placed`; poses that are not "
+        "placed are meaningless. Add edges or scans that bridge the parts."
+    ),
+}

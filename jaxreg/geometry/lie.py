@@ -1,0 +1,160 @@
+"""SE(2) and SE(3) as homogeneous matrices: the only module that imports jaxlie.
+
+Tangent vectors are translation first, then rotation (k = 3 in 2D, 6 in 3D). The
+dimension is read from the shape, the dtype is that of the input: jaxlie 1.5 leaks
+float64 from float32 when x64 is on and fails under strict promotion, so both settings
+are relaxed around its calls and results are cast back.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from jaxreg._core.typing import Key, Motions
+
+
+P = ParamSpec("P")
+
+
+def _behind(fn: Callable[P, Array]) -> Callable[P, Array]:
+    """Runs `fn` with relaxed promotion rules and casts to its first input's dtype."""
+
+    @functools.wraps(fn)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> Array:
+        first = args[0]
+        assert isinstance(first, jax.Array)
+        with (
+            jax.numpy_dtype_promotion("standard"),
+            jax.numpy_rank_promotion("allow"),
+        ):
+            return fn(*args, **kwargs).astype(first.dtype)
+
+    return wrapped
+
+
+def tangent_dim(d: int) -> int:
+    """k, the number of degrees of freedom of SE(d)."""
+    return 3 if d == 2 else 6
+
+
+@_behind
+def exp(tangent: Float[Array, "*b k"]) -> Motions:
+    """The motion of a tangent vector (translation first)."""
+    group = jaxlie.SE2 if tangent.shape[-1] == 3 else jaxlie.SE3
+    return group.exp(tangent).as_matrix()
+
+
+@_behind
+def log(T: Motions) -> Float[Array, "*b k"]:
+    """The tangent vector of a motion (translation first); differentiable at identity.
+
+    Rotations are read through a unit quaternion, so small departures from
+    orthonormality are forgiven. At a rotation of pi one of the two logarithms is
+    returned.
+    """
+    group = jaxlie.SE2 if T.shape[-1] == 3 else jaxlie.SE3
+    return group.from_matrix(T).log()
+
+
+@_behind
+def adjoint(T: Motions) -> Float[Array, "*b k k"]:
+    """Ad(T): `T exp(v) inv(T) = exp(Ad(T) v)`."""
+    group = jaxlie.SE2 if T.shape[-1] == 3 else jaxlie.SE3
+    return group.from_matrix(T).adjoint()
+
+
+def compose(
+    rotation: Float[Array, "*b d d"], translation: Float[Array, "*b d"]
+) -> Motions:
+    """The homogeneous matrix of a rotation and a translation."""
+    d = rotation.shape[-1]
+    batch = jnp.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    rotation = jnp.broadcast_to(rotation, (*batch, d, d))
+    translation = jnp.broadcast_to(translation, (*batch, d))
+    top = jnp.concatenate([rotation, translation[..., None]], axis=-1)
+    last = jnp.zeros((*batch, 1, d + 1), dtype=top.dtype).at[..., d].set(1)
+    return jnp.concatenate([top, last], axis=-2)
+
+
+def rotation(T: Motions) -> Float[Array, "*b d d"]:
+    """The rotation block."""
+    return T[..., :-1, :-1]
+
+
+def translation(T: Motions) -> Float[Array, "*b d"]:
+    """The translation column."""
+    return T[..., :-1, -1]
+
+
+def inverse(T: Motions) -> Motions:
+    """The inverse motion, by transposition."""
+    R_inv = jnp.swapaxes(rotation(T), -1, -2)
+    return compose(R_inv, -jnp.sum(R_inv * translation(T)[..., None, :], axis=-1))
+
+
+def act(T: Float[Array, "D D"], points: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+    """Applies one motion to points.
+
+    Written as a broadcast multiply and sum: a matrix product may be run in reduced
+    precision on accelerators.
+    """
+    R, t = rotation(T), translation(T)
+    return jnp.sum(points[..., None, :] * R, axis=-1) + t
+
+
+def identity(d: int, dtype: jnp.dtype | type, batch: tuple[int, ...] = ()) -> Motions:
+    """Identity motions with leading batch axes."""
+    return jnp.broadcast_to(jnp.eye(d + 1, dtype=dtype), (*batch, d + 1, d + 1))
+
+
+def orthonormalise(T: Motions) -> Motions:
+    """The motion whose rotation is nearest in Frobenius norm (no gradient at ties).
+
+    Products of many float32 motions drift from the group; loops call this.
+    """
+    U, _, Vt = jnp.linalg.svd(rotation(T), full_matrices=False)
+    sign = jnp.sign(jnp.linalg.det(U) * jnp.linalg.det(Vt))
+    U = U.at[..., -1].multiply(sign[..., None])
+    return compose(U @ Vt, translation(T))
+
+
+def random_rotations(
+    key: Key, num: int, d: int, dtype: jnp.dtype | type
+) -> Float[Array, "p d d"]:
+    """Rotations drawn uniformly from SO(d)."""
+    if d == 2:
+        angle = jax.random.uniform(key, (num,), dtype, -jnp.pi, jnp.pi)
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        return jnp.stack([jnp.stack([c, -s], -1), jnp.stack([s, c], -1)], -2)
+    q = jax.random.normal(key, (num, 4), dtype)
+    q = q / jnp.linalg.norm(q, axis=-1, keepdims=True)
+    w, x, y, z = q[:, 0], q[:, 1], q[:, 2], q[:, 3]
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotation_angle(R: Float[Array, "*b d d"]) -> Float[Array, "*b"]:
+    """The angle of rotation in [0, pi], accurate also near 0 and pi (no arccos)."""
+    if R.shape[-1] == 2:
+        return jnp.abs(jnp.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1]))
+    vee = jnp.stack(
+        [
+            R[..., 2, 1] - R[..., 1, 2],
+            R[..., 0, 2] - R[..., 2, 0],
+            R[..., 1, 0] - R[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    sq = jnp.sum(vee * vee, axis=-1)
+    sine = jnp.where(sq > 0, jnp.sqrt(jnp.where(sq > 0, sq, 1)), 0)
+    return jnp.arctan2(sine, trace - 1)

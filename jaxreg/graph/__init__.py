@@ -1,0 +1,1 @@
+"""Relative motions between frames as a graph."""

@@ -1,0 +1,22 @@
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+
+# Set before JAX starts: compiled programs are shared between runs and workers.
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache")
+)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("MPLBACKEND", "agg")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _bounded_number_of_live_programs() -> Iterator[None]:
+    """A process that holds hundreds of compiled programs can die on CPU."""
+    yield
+    import jax
+
+    jax.clear_caches()
