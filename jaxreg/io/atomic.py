@@ -15,7 +15,7 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     """Opens a file beside `path` that takes its place when the block succeeds.
 
     If the block raises, the new file is removed and an older file of that name stays
-    as it was. Text is UTF-8 with newline "\\n".
+    as it was. Text is UTF-8 with Unix line ends.
 
     Args:
         path: where the file shall appear; its folder must exist.
@@ -28,7 +28,6 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
     if mode not in ("w", "wb"):
         raise ValueError(f"mode: wanted 'w' or 'wb', found {mode!r}.")
     path = Path(path)
-    text = {} if mode == "wb" else {"encoding": "utf-8", "newline": "\n"}
     try:
         handle, beside = tempfile.mkstemp(
             prefix=f".{path.name}.", suffix=".part", dir=path.parent
@@ -39,7 +38,13 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
             "Choose a folder that exists and that you may write to."
         ) from err
     try:
-        with os.fdopen(handle, mode, **text) as file:
+        text = mode == "w"
+        with open(
+            handle,
+            mode,
+            encoding="utf-8" if text else None,
+            newline="\n" if text else None,
+        ) as file:
             yield file
             file.flush()
             os.fsync(handle)
@@ -51,29 +56,45 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         raise
 
 
-def require_writable(folder: str | Path) -> Path:
-    """Makes a folder if needed and tries it, before hours of work depend on it.
+@contextlib.contextmanager
+def atomic_folder(folder: str | Path) -> Iterator[Path]:
+    """Yields a staging folder whose files move into `folder` when the block succeeds.
+
+    If the block raises, none of them appears: `folder` never holds half a result.
 
     Args:
-        folder: an existing folder or one to be made, parents included.
+        folder: made if needed, parents included; files of other names in it stay.
 
-    Returns:
-        The folder as a path.
+    Raises:
+        InputError: if the folder cannot be written.
+    """
+    folder = Path(folder)
+    require_writable(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".jaxreg-", dir=folder) as staging:
+        yield Path(staging)
+        for file in sorted(Path(staging).iterdir()):
+            os.replace(file, folder / file.name)
+
+
+def require_writable(folder: str | Path) -> None:
+    """Tries whether a folder can be made and written, and leaves no trace.
+
+    Meant to be called before the computation whose results go there.
 
     Raises:
         InputError: if it cannot be made or written.
     """
     folder = Path(folder)
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as err:
         raise InputError(
             f"{folder}: cannot be written ({err.strerror}).\n"
-            "Choose another output folder with --out."
+            "Choose another output folder."
         ) from err
-    return folder
 
 
 def _umask() -> int:

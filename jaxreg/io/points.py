@@ -1,0 +1,210 @@
+"""Reading point sets: one entry point that goes by the suffix of the file."""
+
+import gzip
+import io
+import re
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from jaxreg.io import ply, text
+from jaxreg.io.errors import InputError
+
+
+TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
+SUFFIXES = (".ply", ".npy", ".npz", *TEXT)
+_FORMATS = "PLY, XYZ/CSV/TXT text (each also .gz), NPY or NPZ"
+
+
+def read_points(path: str | Path) -> np.ndarray:
+    """Reads one point set.
+
+    PLY (binary or ASCII, through plyfile) and text files may be compressed (`.gz`).
+    Text is separated by commas, semicolons or white space, with or without a header
+    line; the first three numeric columns are taken, or both if there are two. One scan
+    of an NPZ file that holds several is named as `FILE.npz:KEY`.
+
+    Args:
+        path: the file.
+
+    Returns:
+        `(n, d)` array, d = 2 or 3, float32 if the file holds float32, else float64, in
+        the unit of the file. Rows with NaN or inf are kept.
+
+    Raises:
+        InputError: if the file is missing, unreadable, empty, or holds no points.
+        MissingExtraError: if the file is PLY and plyfile is not installed.
+    """
+    path, key = _split_key(path)
+    if _suffix(path) != ".npz":
+        return _read_file(path)
+    scans = _read_npz(path)
+    if key is None and len(scans) > 1:
+        raise InputError(
+            f"{path}: holds {len(scans)} scans: {_listing(scans)}.\n"
+            f"Name one of them, for example {path}:{next(iter(scans))}"
+        )
+    if key is not None and key not in scans:
+        raise InputError(f"{path}: has no scan {key}.\nIt holds: {_listing(scans)}.")
+    return scans[key] if key is not None else next(iter(scans.values()))
+
+
+def read_scans(
+    paths: str | Path | Iterable[str | Path],
+) -> tuple[list[str], list[np.ndarray]]:
+    """Reads scans from files, NPZ archives and folders, in the order given.
+
+    Args:
+        paths: each is a file as for `read_points`, an NPZ file of which every key is a
+            scan, or a folder, of which all point files are read in natural order
+            (`scan2` before `scan10`).
+
+    Returns:
+        Names, made of file names without suffix or NPZ keys and unique, and as many
+        `(n_i, d)` arrays.
+
+    Raises:
+        InputError: as `read_points`, and if a folder holds no point file.
+    """
+    names: list[str] = []
+    scans: list[np.ndarray] = []
+    for path in [paths] if isinstance(paths, (str, Path)) else paths:
+        for file in _expand(Path(path)):
+            bare, key = _split_key(file)
+            if _suffix(bare) == ".npz" and key is None:
+                found = _read_npz(bare)
+            else:
+                found = {key or stem(bare): read_points(file)}
+            names += found.keys()
+            scans += found.values()
+    return _unique(names), scans
+
+
+def stem(path: str | Path) -> str:
+    """The name of a file without its folder and without `.ply`, `.ply.gz` and such."""
+    name = Path(path).name
+    name = name[:-3] if name.lower().endswith(".gz") else name
+    return name[: -len(Path(name).suffix)] if Path(name).suffix else name
+
+
+def _read_file(path: Path) -> np.ndarray:
+    suffix = _suffix(path)
+    if suffix not in SUFFIXES:
+        raise InputError(
+            f"{path}: unknown kind of file {suffix or '(no suffix)'}.\n"
+            f"Wanted {_FORMATS}."
+        )
+    data = _read_bytes(path)
+    if suffix == ".ply":
+        points = ply.parse_ply(data, path)
+    elif suffix == ".npy":
+        points = _as_points(_load_npy(data, path), str(path))
+    else:
+        points = text.parse_text(data, path)
+    return points
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+        if path.name.lower().endswith(".gz") and data:
+            data = gzip.decompress(data)
+    except FileNotFoundError as err:
+        raise InputError(f"{path}: no such file.\nCheck the name and folder.") from err
+    except (OSError, EOFError, zlib.error) as err:
+        reason = getattr(err, "strerror", None) or "damaged gzip data"
+        raise InputError(
+            f"{path}: cannot be read ({reason}).\nCheck the file and its permissions."
+        ) from err
+    if not data:
+        raise InputError(f"{path}: the file is empty.\nExport or copy the scan again.")
+    return data
+
+
+def _load_npy(data: bytes, path: Path) -> np.ndarray:
+    try:
+        return np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as err:
+        raise InputError(
+            f"{path}: not a NumPy file of plain numbers.\n"
+            "Save it with numpy.save as one float array of shape (n, 3) or (n, 2)."
+        ) from err
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    data = _read_bytes(path)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            arrays = {
+                stem(name): np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
+                for name in archive.namelist()
+            }
+    except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error) as err:
+        raise InputError(
+            f"{path}: not an NPZ file of plain numbers.\n"
+            "Save it with numpy.savez(file, name=points, ...)."
+        ) from err
+    if not arrays:
+        raise InputError(f"{path}: holds no arrays.\nSave each scan under a name.")
+    return {key: _as_points(a, f"{path}:{key}") for key, a in arrays.items()}
+
+
+def _as_points(array: np.ndarray, name: str) -> np.ndarray:
+    if array.ndim != 2 or array.shape[1] not in (2, 3) or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"{name}: found an array of shape {array.shape} and type {array.dtype}.\n"
+            "Wanted numbers of shape (n, 3) or (n, 2), one point a row."
+        )
+    if array.shape[0] == 0:
+        raise InputError(f"{name}: holds no points.\nExport or copy the scan again.")
+    narrow = array.dtype.kind == "f" and array.dtype.itemsize <= 4
+    return array.astype(np.float32 if narrow else np.float64)
+
+
+def _expand(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    files = [
+        f
+        for f in path.iterdir()
+        if f.is_file() and not f.name.startswith(".") and _suffix(f) in SUFFIXES
+    ]
+    if not files:
+        raise InputError(
+            f"{path}: the folder holds no point files.\nWanted {_FORMATS}."
+        )
+    return sorted(files, key=lambda f: _natural(f.name))
+
+
+def _split_key(path: str | Path) -> tuple[Path, str | None]:
+    match = re.fullmatch(r"(.*\.npz):([^/\\]+)", str(path), re.IGNORECASE)
+    return (Path(match[1]), match[2]) if match else (Path(path), None)
+
+
+def _suffix(path: Path) -> str:
+    name = path.name.lower()
+    packed = name.endswith(".gz")
+    suffix = Path(name[:-3] if packed else name).suffix
+    return suffix + ".gz" if packed and suffix in (".npy", ".npz", "") else suffix
+
+
+def _natural(name: str) -> list[tuple[int, int | str]]:
+    parts = re.split(r"(\d+)", name.lower())
+    return [(0, int(p)) if p.isdigit() else (1, p) for p in parts if p]
+
+
+def _unique(names: list[str]) -> list[str]:
+    seen: dict[str, int] = {}
+    out: list[str] = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        out.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
+    return out
+
+
+def _listing(scans: dict[str, np.ndarray]) -> str:
+    names = list(scans)
+    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
