@@ -1,6 +1,6 @@
 """`PoseGraph`: relative motions between frames, the input of motion averaging."""
 
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -8,23 +8,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.checks import as_float_array
+from jaxreg._core.checks import as_float_array, check_mask
 from jaxreg.geometry import lie
+
+
+#: A motion whose rotation is this far from orthonormal is projected, further refused.
+ROTATION_TOLERANCE = 1e-2
 
 
 class PoseGraph(eqx.Module):
     """Edges (i, j) that hold `T_i_j`, which maps frame j into frame i.
 
-    A pytree of arrays with a static number of poses. Padded edges have `mask` False
-    and count for nothing.
+    A pytree of arrays with a static number of poses; build it with `from_edges`.
+    Padded edges have `mask` False and count for nothing. Several edges between the
+    same two frames, in any direction and order, are several measurements.
 
     Attributes:
         edges: `(e, 2)` int32, the frames i and j of each edge.
         T_i_j: `(e, d+1, d+1)` relative motions, `inv(T_world_i) @ T_world_j`.
-        weight: `(e,)` prior weight of each edge, at least 0.
+        weight: `(e,)` prior weight of each edge, at least 0; 0 where masked.
         mask: `(e,)` True for real edges.
-        information: `(e, k, k)` information matrix of the left tangent error of
-            `T_i_j` (translation first), or None.
+        information: `(e, k, k)` information matrix, or None, of the right tangent
+            error `log(inv(T_i_j) inv(T_world_i) T_world_j)`, translation first: the
+            frame and order of g2o.
         num_poses: number of frames, static.
     """
 
@@ -34,3 +40,253 @@ class PoseGraph(eqx.Module):
     mask: Bool[Array, " e"]
     information: Float[Array, "e k k"] | None
     num_poses: int = eqx.field(static=True)
+
+    @classmethod
+    def from_edges(
+        cls,
+        edges: object,
+        T_i_j: object,
+        num_poses: int | None = None,
+        weight: object = None,
+        information: object = None,
+        mask: object = None,
+    ) -> Self:
+        """Checks relative motions and makes a graph of them.
+
+        Args:
+            edges: `(e, 2)` integers, the frames i and j, counted from 0.
+            T_i_j: `(e, d+1, d+1)` motions that map frame j into frame i, float32 or
+                float64; the graph has their dtype.
+            num_poses: number of frames; None for the largest id plus one.
+            weight: `(e,)` prior weights of at least 0, or None for all one.
+            information: `(e, k, k)` positive semidefinite matrices, or None.
+            mask: `(e,)` False for padding, whose other values do not matter.
+
+        Raises:
+            ValueError: for wrong shapes; and, where the values are known (not while
+                tracing), for ids out of range, self-edges, numbers that are not finite,
+                negative weights, indefinite information, and matrices that are further
+                than 1e-2 from a motion. Nearer ones are projected onto SE(d). The
+                message names the first such edge.
+        """
+        motions = as_float_array(T_i_j, "T_i_j")
+        if motions.ndim != 3 or motions.shape[1:] not in ((3, 3), (4, 4)):
+            raise ValueError(
+                f"T_i_j: wanted shape (e, 3, 3) or (e, 4, 4), found {motions.shape}."
+            )
+        num, dtype = motions.shape[0], motions.dtype
+        ids = _check_ids(edges, num)
+        valid = check_mask(mask, (num,), "mask")
+        weights = _check_extra(weight, (num,), "weight", dtype)
+        k = lie.tangent_dim(motions.shape[-1] - 1)
+        info = _check_extra(information, (num, k, k), "information", dtype)
+        if num_poses is None:
+            num_poses = _count_poses(ids, valid)
+        if num_poses < 1:
+            raise ValueError(f"num_poses: wanted at least 1, found {num_poses}.")
+        _check_ids_values(ids, valid, num_poses)
+        motions = _check_motions(motions, ids, valid)
+        _check_weights(weights, ids, valid)
+        _check_information(info, ids, valid)
+        graph = cls(
+            edges=ids,
+            T_i_j=motions,
+            weight=jnp.ones((num,), dtype) if weights is None else weights,
+            mask=valid,
+            information=info,
+            num_poses=num_poses,
+        )
+        return graph._cleaned() if num else graph.padded(1)
+
+    def _cleaned(self) -> Self:
+        """The graph with harmless values in the masked rows."""
+        eye = jnp.eye(self.T_i_j.shape[-1], dtype=self.T_i_j.dtype)
+        keep = self.mask[:, None, None]
+        info = self.information
+        return type(self)(
+            edges=jnp.where(self.mask[:, None], self.edges, 0),
+            T_i_j=jnp.where(keep, self.T_i_j, eye),
+            weight=jnp.where(self.mask, self.weight, 0),
+            mask=self.mask,
+            information=None if info is None else jnp.where(keep, info, 0),
+            num_poses=self.num_poses,
+        )
+
+    def padded(self, num_edges: int) -> Self:
+        """The same graph with masked edges appended up to `num_edges`.
+
+        Args:
+            num_edges: the new number of rows, at least the present one.
+        """
+        extra = num_edges - self.edges.shape[0]
+        if extra < 0:
+            raise ValueError(
+                f"num_edges: wanted at least {self.edges.shape[0]}, found {num_edges}."
+            )
+
+        def pad(x: Array) -> Array:
+            return jnp.pad(x, [(0, extra)] + [(0, 0)] * (x.ndim - 1))
+
+        return jax.tree.map(pad, self)._cleaned()
+
+    @property
+    def num_edges(self) -> int:
+        """Rows of `edges`, padding included (static)."""
+        return self.edges.shape[-2]
+
+    @property
+    def dim(self) -> int:
+        """The dimension d of space, 2 or 3."""
+        return self.T_i_j.shape[-1] - 1
+
+    def residual_motions(
+        self, T_world_i: Float[Array, "v D D"]
+    ) -> Float[Array, "e D D"]:
+        """`T_world_i T_i_j inv(T_world_j)` of each edge (MCC paper, Eq. 14)."""
+        i, j = self.edges[:, 0], self.edges[:, 1]
+        return T_world_i[i] @ self.T_i_j @ lie.inverse(T_world_i)[j]
+
+    def differences(
+        self, T_world_i: Float[Array, "v D D"]
+    ) -> tuple[Float[Array, " e"], Float[Array, " e"]]:
+        """Squared Frobenius norms of `T_i_j - inv(T_world_i) T_world_j` by block.
+
+        Returns:
+            Of the rotation (about 2 angle^2) and of the translation (length^2); 0 where
+            masked.
+        """
+        i, j = self.edges[:, 0], self.edges[:, 1]
+        gap = self.T_i_j - lie.inverse(T_world_i)[i] @ T_world_i[j]
+        gap = jnp.where(self.mask[:, None, None], gap, 0)
+        return (
+            jnp.sum(lie.rotation(gap) ** 2, axis=(-2, -1)),
+            jnp.sum(lie.translation(gap) ** 2, axis=-1),
+        )
+
+    def tangent_errors(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, "e k"]:
+        """`log(inv(T_i_j) inv(T_world_i) T_world_j)`, the error of g2o and GTSAM."""
+        i, j = self.edges[:, 0], self.edges[:, 1]
+        predicted = lie.inverse(T_world_i)[i] @ T_world_i[j]
+        return lie.log(lie.inverse(self.T_i_j) @ predicted)
+
+    def __repr__(self) -> str:
+        batch = self.edges.shape[:-2]
+        of = f"batch {batch} of " if batch else ""
+        return (
+            f"PoseGraph({of}{self.num_poses} poses in {self.dim}D, "
+            f"{self.num_edges} edges, {self.T_i_j.dtype})"
+        )
+
+
+def _known(x: Any) -> bool:
+    return not isinstance(x, jax.core.Tracer)
+
+
+def _check_ids(edges: object, num: int) -> Int[Array, "e 2"]:
+    ids = edges if isinstance(edges, jax.Array) else np.asarray(edges)
+    if not ids.size:
+        ids = np.zeros((0, 2), np.int32)
+    if ids.ndim != 2 or ids.shape != (num, 2):
+        raise ValueError(
+            f"edges: wanted shape ({num}, 2) as T_i_j has {num} rows, "
+            f"found {ids.shape}."
+        )
+    if not jnp.issubdtype(ids.dtype, jnp.integer):
+        raise TypeError(f"edges: wanted integers, found dtype {ids.dtype}.")
+    if isinstance(ids, np.ndarray) and ids.size:
+        if ids.max() > np.iinfo(np.int32).max or ids.min() < 0:
+            raise ValueError(
+                "edges: ids must lie between 0 and 2^31 - 1, found "
+                f"{ids.min()} to {ids.max()}."
+            )
+    return jnp.asarray(ids).astype(jnp.int32)
+
+
+def _check_extra(
+    x: object, shape: tuple[int, ...], name: str, dtype: Any
+) -> Array | None:
+    if x is None:
+        return None
+    out = as_float_array(x, name).astype(dtype)
+    if out.shape != shape:
+        raise ValueError(f"{name}: wanted shape {shape}, found {out.shape}.")
+    return out
+
+
+def _count_poses(ids: Array, valid: Array) -> int:
+    if not (_known(ids) and _known(valid)):
+        raise ValueError("num_poses: must be given while tracing.")
+    used = np.asarray(ids)[np.asarray(valid)]
+    if not used.size:
+        raise ValueError("num_poses: must be given for a graph without edges.")
+    return int(used.max()) + 1
+
+
+def _refuse(bad: np.ndarray, ids: Array, what: str) -> None:
+    """Raises ValueError that names the first edge with `bad` True."""
+    if bad.any():
+        e = int(np.argmax(bad))
+        pair = f" ({ids[e, 0]}, {ids[e, 1]})" if _known(ids) else ""
+        more = int(bad.sum()) - 1
+        others = f" (and {more} more)" if more else ""
+        raise ValueError(f"edge {e}{pair}{others}: {what}")
+
+
+def _check_ids_values(ids: Array, valid: Array, num_poses: int) -> None:
+    if not (_known(ids) and _known(valid)):
+        return
+    i, m = np.asarray(ids), np.asarray(valid)
+    outside = ((i < 0) | (i >= num_poses)).any(axis=1) & m
+    _refuse(outside, ids, f"ids must lie between 0 and {num_poses - 1}.")
+    _refuse((i[:, 0] == i[:, 1]) & m, ids, "joins a frame with itself.")
+
+
+def _check_motions(motions: Array, ids: Array, valid: Array) -> Array:
+    if not (_known(motions) and _known(valid)) or not motions.shape[0]:
+        return motions
+    T, m = np.asarray(motions, dtype=np.float64), np.asarray(valid)
+    T = np.where(m[:, None, None], T, np.eye(T.shape[-1]))
+    _refuse(~np.isfinite(T).all(axis=(1, 2)), ids, "T_i_j is not finite.")
+    d = T.shape[-1] - 1
+    _refuse(
+        np.abs(T[:, d] - np.eye(d + 1)[d]).max(axis=1) > ROTATION_TOLERANCE,
+        ids,
+        f"the last row of T_i_j is not {[0] * d + [1]}.",
+    )
+    R = T[:, :d, :d]
+    skewed = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(d)).max(axis=(1, 2))
+    _refuse(
+        (skewed > ROTATION_TOLERANCE) | (np.linalg.det(R) < 0),
+        ids,
+        "the rotation of T_i_j is not orthonormal within "
+        f"{ROTATION_TOLERANCE:g} or is a reflection.",
+    )
+    off = skewed > 4 * np.finfo(motions.dtype).eps
+    if not off.any() and not (T[:, d] != np.eye(d + 1)[d]).any():
+        return motions
+    U, _, Vt = np.linalg.svd(R[off])
+    T[off, :d, :d] = U @ Vt
+    T[:, d] = np.eye(d + 1)[d]
+    return jnp.asarray(T.astype(motions.dtype))
+
+
+def _check_weights(weights: Array | None, ids: Array, valid: Array) -> None:
+    if weights is None or not (_known(weights) and _known(valid)):
+        return
+    w, m = np.asarray(weights), np.asarray(valid)
+    _refuse((w < 0) & m, ids, "weight is negative.")
+    _refuse(~np.isfinite(w) & m, ids, "weight is not finite.")
+
+
+def _check_information(info: Array | None, ids: Array, valid: Array) -> None:
+    if info is None or not (_known(info) and _known(valid)) or not info.shape[0]:
+        return
+    M, m = np.asarray(info, dtype=np.float64), np.asarray(valid)
+    M = np.where(m[:, None, None], M, 0)
+    _refuse(~np.isfinite(M).all(axis=(1, 2)), ids, "information is not finite.")
+    largest = np.abs(M).max(axis=(1, 2))
+    lopsided = np.abs(M - np.swapaxes(M, 1, 2)).max(axis=(1, 2))
+    _refuse(lopsided > 1e-5 * largest, ids, "information is not symmetric.")
+    # Information matrices printed with six digits may be indefinite by rounding.
+    lowest = np.linalg.eigvalsh(M)[:, 0]
+    _refuse(lowest < -1e-5 * largest, ids, "information is indefinite.")

@@ -1,0 +1,9 @@
+"""One pose per frame from relative motions."""
+
+from jaxreg.averaging.average import average as average
+from jaxreg.averaging.base import AbstractAverager as AbstractAverager
+from jaxreg.averaging.base import AveragingSolution as AveragingSolution
+from jaxreg.averaging.correntropy import Correntropy as Correntropy
+from jaxreg.averaging.plain import MotionAveraging as MotionAveraging
+from jaxreg.averaging.plain import WeightedMotionAveraging as WeightedMotionAveraging
+from jaxreg.averaging.tree import SpanningTree as SpanningTree

@@ -1,0 +1,141 @@
+"""The contract of every averaging method, and its solution."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.status import Status
+from jaxreg._core.typing import Key, StatusArray
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import PoseGraph
+
+
+class AveragingSolution(eqx.Module):
+    """One pose per frame. Arrays only: it passes through jit, vmap and pickling.
+
+    Attributes:
+        T_world_i: `(v, d+1, d+1)` poses; frame 0 at `init[0]`, else the identity. Poses
+            of frames that are not placed are the identity and mean nothing.
+        edge_weight: `(e,)` how much the method trusts each edge, from 0 to 1, without
+            the prior weight; 0 where masked.
+        status: int32, see `jaxreg.Status`.
+        placed: `(v,)` True for frames joined to frame 0 by edges of positive weight.
+        kernel_width: `(2,)` final width of the correntropy kernel for translation
+            (unit of the input) and rotation (radians); inf for methods without one.
+        num_steps: int32, steps taken.
+        residual: mean over the edges, by prior weight, of the Frobenius norm of
+            `T_i_j - inv(T_world_i) T_world_j` with lengths in `length_scale`
+            (MCC paper, Eq. 22).
+        length_scale: the length that stands for one radian; see `length_scale`.
+    """
+
+    T_world_i: Float[Array, "v D D"]
+    edge_weight: Float[Array, " e"]
+    status: StatusArray
+    placed: Bool[Array, " v"]
+    kernel_width: Float[Array, "2"]
+    num_steps: Int[Array, ""]
+    residual: Float[Array, ""]
+    length_scale: Float[Array, ""]
+
+    def __repr__(self) -> str:
+        if isinstance(self.status, jax.core.Tracer) or self.status.ndim:
+            return f"AveragingSolution(T_world_i {self.T_world_i.shape})"
+        status = Status(int(self.status)).name
+        trusted = int(jnp.sum(self.edge_weight > 0.5))
+        return (
+            f"AveragingSolution({status}: {int(jnp.sum(self.placed))} of "
+            f"{self.placed.shape[0]} poses placed, {trusted} of "
+            f"{self.edge_weight.shape[0]} edges trusted,\n"
+            f"    residual {float(self.residual):.4g}, {int(self.num_steps)} steps)"
+        )
+
+
+class AbstractAverager(eqx.Module):
+    """A method of motion averaging: settings only, frozen.
+
+    Methods are called by `jaxreg.average`, which has checked the graph, reduced it to
+    what frame 0 reaches, and fixed the gauge: they leave frame 0 at the identity, and
+    edges outside the component of frame 0 have weight 0.
+    """
+
+    @abc.abstractmethod
+    def solve(
+        self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
+    ) -> AveragingSolution:
+        """Averages a prepared graph; `init` has frame 0 at the identity, or is None."""
+
+
+def length_scale(graph: PoseGraph) -> Float[Array, ""]:
+    """The length that stands for one radian: the mean |t_i_j| of the middle half.
+
+    It comes from the data, so that another unit of length gives the same answer.
+    Half of the edges may be wrong without moving it far. 1 if there is no length.
+    """
+    length = jnp.linalg.norm(
+        lie.translation(jax.lax.stop_gradient(graph.T_i_j)), axis=-1
+    )
+    valid = graph.weight > 0
+    low, high = (
+        masked_quantile(length, valid, 0.25),
+        masked_quantile(length, valid, 0.75),
+    )
+    middle = valid & (length >= low) & (length <= high)
+    count = jnp.maximum(jnp.sum(middle), 1).astype(length.dtype)
+    mean = jnp.sum(jnp.where(middle, length, 0)) / count
+    return jnp.where(mean > 0, mean, 1)
+
+
+def masked_quantile(
+    x: Float[Array, " e"], mask: Bool[Array, " e"], q: float | Array
+) -> Float[Array, ""]:
+    """The value of `x[mask]` at quantile q (nearest rank); 0 if the mask is empty."""
+    count = jnp.sum(mask)
+    rank = jnp.floor(q * (count - 1).astype(x.dtype) + 0.5).astype(jnp.int32)
+    value = jnp.sort(jnp.where(mask, x, jnp.inf))[jnp.maximum(rank, 0)]
+    return jnp.where(count > 0, value, 0)
+
+
+def frobenius(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"], scale: Float[Array, ""]
+) -> Float[Array, " e"]:
+    """|T_i_j - inv(T_world_i) T_world_j|_F with lengths over `scale` (Eq. 22)."""
+    rotation, translation = graph.differences(T_world_i)
+    sq = rotation + translation / scale**2
+    return jnp.where(sq > 0, jnp.sqrt(jnp.where(sq > 0, sq, 1)), 0)
+
+
+def weighted_mean(x: Array, weight: Array) -> Array:
+    """The mean of x by weight; 0 where there is no weight."""
+    total = jnp.sum(weight)
+    return jnp.sum(weight * x) / jnp.where(total > 0, total, 1)
+
+
+def solution(
+    graph: PoseGraph,
+    T_world_i: Float[Array, "v D D"],
+    *,
+    edge_weight: Array | None = None,
+    converged: Array | None = None,
+    kernel_width: Array | None = None,
+    num_steps: Array | int = 0,
+) -> AveragingSolution:
+    """Fills in what is the same for every method."""
+    dtype = T_world_i.dtype
+    scale = length_scale(graph)
+    trust = jnp.ones(graph.weight.shape, dtype) if edge_weight is None else edge_weight
+    done = jnp.asarray(True) if converged is None else converged
+    width = jnp.full((2,), jnp.inf, dtype) if kernel_width is None else kernel_width
+    return AveragingSolution(
+        T_world_i=T_world_i,
+        edge_weight=jnp.where(graph.mask & (graph.weight > 0), trust, 0),
+        status=jnp.where(done, Status.CONVERGED, Status.MAX_STEPS).astype(jnp.int32),
+        placed=jnp.ones(T_world_i.shape[:1], dtype=bool),
+        kernel_width=width,
+        num_steps=jnp.asarray(num_steps, jnp.int32),
+        residual=weighted_mean(frobenius(graph, T_world_i, scale), graph.weight),
+        length_scale=scale,
+    )

@@ -1,0 +1,208 @@
+"""Components, spanning trees and the poses along them, inside jit.
+
+All functions take `edges` and a weight per edge; edges of weight 0 (or NaN) are
+absent. Every loop takes O(e) work a round; the rounds are logarithmic in the number of
+frames, except for `shortest_path_poses`, whose rounds are the hops of its longest path.
+
+Gradients: none; inputs are cut (the topology is not differentiable, and the poses of
+a tree serve as a start).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg.geometry import lie
+
+
+class Forest(eqx.Module):
+    """A spanning tree of each component, with poses chained along it.
+
+    Attributes:
+        T_world_i: `(v, d+1, d+1)` poses with frame 0 at the identity; the identity for
+            frames that are not reached.
+        reached: `(v,)` True for the frames of the component of frame 0.
+        component: `(v,)` int32, equal for frames of the same component.
+        in_tree: `(e,)` True for the edges of the forest.
+    """
+
+    T_world_i: Float[Array, "v D D"]
+    reached: Bool[Array, " v"]
+    component: Int[Array, " v"]
+    in_tree: Bool[Array, " e"]
+
+
+def components(
+    edges: Int[Array, "e 2"], weight: Float[Array, " e"], num_poses: int
+) -> Int[Array, " v"]:
+    """The smallest frame id of each frame's component.
+
+    Labels spread along edges and are then followed to their own label (pointer
+    jumping), so that long chains take a logarithmic number of rounds.
+    """
+    i, j = edges[:, 0], edges[:, 1]
+    present = weight > 0
+
+    def spread(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        label, _ = state
+        low = jnp.where(present, jnp.minimum(label[i], label[j]), num_poses)
+        new = label.at[label[i]].min(low).at[label[j]].min(low)
+        new = new[new]
+        return new[new], jnp.any(new != label)
+
+    start = jnp.arange(num_poses, dtype=jnp.int32)
+    return jax.lax.while_loop(lambda s: s[1], spread, (start, jnp.asarray(True)))[0]
+
+
+class _Boruvka(NamedTuple):
+    component: Array
+    T_root_i: Array
+    in_tree: Array
+    joined: Array
+
+
+def maximum_spanning_tree(
+    edges: Int[Array, "e 2"],
+    T_i_j: Float[Array, "e D D"],
+    weight: Float[Array, " e"],
+    num_poses: int,
+) -> Forest:
+    """The spanning forest of greatest total weight, ties to the earlier edge.
+
+    Boruvka: every component takes its best outgoing edge, in each of at most log2(v)
+    rounds. Each frame carries its pose in the frame of its component's root, so the
+    poses come with the tree, and products are only as long as the rounds.
+    """
+    edges, T_i_j, weight = jax.lax.stop_gradient((edges, T_i_j, weight))
+    frames = jnp.arange(num_poses, dtype=jnp.int32)
+    start = _Boruvka(
+        component=frames,
+        T_root_i=lie.identity(T_i_j.shape[-1] - 1, T_i_j.dtype, (num_poses,)),
+        in_tree=jnp.zeros(weight.shape, dtype=bool),
+        joined=jnp.asarray(True),
+    )
+    end = jax.lax.while_loop(
+        lambda s: s.joined,
+        lambda s: _join_components(s, edges, T_i_j, weight),
+        start,
+    )
+    reached = end.component == end.component[0]
+    T_world_i = lie.inverse(end.T_root_i[0]) @ end.T_root_i
+    eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
+    T_world_i = jnp.where(reached[:, None, None], T_world_i, eye).at[0].set(eye)
+    return Forest(T_world_i, reached, end.component, end.in_tree)
+
+
+def _join_components(
+    state: _Boruvka, edges: Array, T_i_j: Array, weight: Array
+) -> _Boruvka:
+    """One round: each component hooks onto another through its best edge."""
+    num_poses, num_edges = state.component.shape[0], edges.shape[0]
+    i, j = edges[:, 0], edges[:, 1]
+    ci, cj = state.component[i], state.component[j]
+    leaving = (ci != cj) & (weight > 0)
+    w = jnp.where(leaving, weight, 0)
+    best_weight = jnp.zeros((num_poses,), w.dtype).at[ci].max(w).at[cj].max(w)
+    order = jnp.arange(num_edges, dtype=jnp.int32)
+
+    def first(c: Array) -> Array:
+        return jnp.where(leaving & (w == best_weight[c]), order, num_edges)
+
+    best = jnp.full((num_poses,), num_edges, jnp.int32)
+    best = best.at[ci].min(first(ci)).at[cj].min(first(cj))
+    found = best < num_edges
+    e = jnp.where(found, best, 0)
+    frames = jnp.arange(num_poses, dtype=jnp.int32)
+    outward = ci[e] == frames
+    other = jnp.where(outward, cj[e], ci[e])
+    # Of two components that chose the same edge, the smaller id becomes the root.
+    mutual = found & found[other] & (best[other] == best) & (frames < other)
+    hooks = found & ~mutual
+    parent = jnp.where(hooks, other, frames)
+    X_i, X_j = state.T_root_i[i[e]], state.T_root_i[j[e]]
+    T_ri_rj = X_i @ T_i_j[e] @ lie.inverse(X_j)
+    T_parent_c = jnp.where(outward[:, None, None], lie.inverse(T_ri_rj), T_ri_rj)
+    eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
+    T_parent_c = jnp.where(hooks[:, None, None], T_parent_c, eye)
+    root, T_top_c = follow(parent, T_parent_c)
+    in_tree = state.in_tree.at[jnp.where(hooks, best, num_edges)].set(True, mode="drop")
+    return _Boruvka(
+        root[state.component],
+        T_top_c[state.component] @ state.T_root_i,
+        in_tree,
+        jnp.any(hooks),
+    )
+
+
+def follow(
+    parent: Int[Array, " v"], T_parent_i: Float[Array, "v D D"]
+) -> tuple[Int[Array, " v"], Float[Array, "v D D"]]:
+    """Roots and poses in the frame of the root, by pointer doubling.
+
+    Args:
+        parent: the parent of each frame; roots are their own parent.
+        T_parent_i: the pose in the parent's frame; the identity at roots.
+    """
+
+    def jump(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        up, T = state
+        return up[up], T[up] @ T
+
+    def unfinished(state: tuple[Array, Array]) -> Array:
+        return jnp.any(state[0] != state[0][state[0]])
+
+    return jax.lax.while_loop(unfinished, jump, (parent, T_parent_i))
+
+
+def shortest_path_poses(
+    edges: Int[Array, "e 2"],
+    T_i_j: Float[Array, "e D D"],
+    weight: Float[Array, " e"],
+    num_poses: int,
+) -> tuple[Float[Array, "v D D"], Bool[Array, " v"]]:
+    """Poses along the paths from frame 0 of least total 1 / weight.
+
+    If weights are inverse variances, every frame gets the chain of least variance;
+    if they are all equal, this is a breadth-first tree (Bellman and Ford, in parallel).
+    Weights below a thousandth of the largest count as a thousandth.
+
+    Returns:
+        `T_world_i`, with the identity at frame 0 and at frames that no path reaches,
+        and `(v,)` True for the frames reached.
+    """
+    edges, T_i_j, weight = jax.lax.stop_gradient((edges, T_i_j, weight))
+    i, j = edges[:, 0], edges[:, 1]
+    present = weight > 0
+    # Lengths from 1 to 1000, so that a step never vanishes in a float32 sum.
+    top = jnp.max(jnp.where(present, weight, 0))
+    length = jnp.minimum(top / jnp.where(present, weight, 1), 1000)
+    length = jnp.where(present, length, jnp.inf)
+
+    def relax(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        reach, _ = state
+        new = reach.at[j].min(reach[i] + length).at[i].min(reach[j] + length)
+        return new, jnp.any(new < reach)
+
+    start = jnp.full((num_poses,), jnp.inf, T_i_j.dtype).at[0].set(0)
+    reach, _ = jax.lax.while_loop(lambda s: s[1], relax, (start, jnp.asarray(True)))
+    reached = jnp.isfinite(reach)
+    num_edges = edges.shape[0]
+    order = jnp.arange(num_edges, dtype=jnp.int32)
+    to_j = jnp.where(present & (reach[i] + length == reach[j]), order, 2 * num_edges)
+    to_i = jnp.where(
+        present & (reach[j] + length == reach[i]), order + num_edges, 2 * num_edges
+    )
+    code = jnp.full((num_poses,), 2 * num_edges, jnp.int32).at[j].min(to_j)
+    code = code.at[i].min(to_i).at[0].set(2 * num_edges)
+    has = code < 2 * num_edges
+    backward = code >= num_edges
+    e = jnp.where(has, jnp.where(backward, code - num_edges, code), 0)
+    frames = jnp.arange(num_poses, dtype=jnp.int32)
+    parent = jnp.where(has, jnp.where(backward, j[e], i[e]), frames)
+    eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
+    T_parent = jnp.where(backward[:, None, None], lie.inverse(T_i_j[e]), T_i_j[e])
+    T_parent = jnp.where(has[:, None, None], T_parent, eye)
+    return follow(parent, T_parent)[1], reached
