@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, StatusArray
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, is_concrete
 
 
 class AveragingSolution(eqx.Module):
@@ -42,7 +42,7 @@ class AveragingSolution(eqx.Module):
     length_scale: Float[Array, ""]
 
     def __repr__(self) -> str:
-        if isinstance(self.status, jax.core.Tracer) or self.status.ndim:
+        if not is_concrete(self.status) or self.status.ndim:
             return f"AveragingSolution(T_world_i {self.T_world_i.shape})"
         status = Status(int(self.status)).name
         trusted = int(jnp.sum(self.edge_weight > 0.5))

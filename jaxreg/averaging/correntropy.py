@@ -92,7 +92,7 @@ class Correntropy(AbstractAverager):
 def gaussian_trust(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"], width: Float[Array, "2"]
 ) -> Float[Array, " e"]:
-    """G_sigma of the residual of each edge (Eq. 12), widths by part: (length, angle)."""
+    """G_sigma of the residual of each edge (Eq. 12); widths are (length, angle)."""
     rotation, translation = graph.differences(T_world_i)
     sq = translation / width[0] ** 2 + rotation / (2 * width[1] ** 2)
     return jnp.exp(-sq / 2)

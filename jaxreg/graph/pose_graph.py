@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import as_float_array, check_mask
@@ -178,8 +179,17 @@ class PoseGraph(eqx.Module):
         )
 
 
-def _known(x: Any) -> bool:
-    return not isinstance(x, jax.core.Tracer)
+class EdgeError(ValueError):
+    """A value of one edge that no graph can hold; `edge` is its row."""
+
+    def __init__(self, message: str, edge: int):
+        super().__init__(message)
+        self.edge = edge
+
+
+def is_concrete(x: Any) -> bool:
+    """True where the values can be read, False while tracing."""
+    return not eqx.is_array(x) or not isinstance(x, Tracer)
 
 
 def _check_ids(edges: object, num: int) -> Int[Array, "e 2"]:
@@ -214,7 +224,7 @@ def _check_extra(
 
 
 def _count_poses(ids: Array, valid: Array) -> int:
-    if not (_known(ids) and _known(valid)):
+    if not (is_concrete(ids) and is_concrete(valid)):
         raise ValueError("num_poses: must be given while tracing.")
     used = np.asarray(ids)[np.asarray(valid)]
     if not used.size:
@@ -222,18 +232,18 @@ def _count_poses(ids: Array, valid: Array) -> int:
     return int(used.max()) + 1
 
 
-def _refuse(bad: np.ndarray, ids: Array, what: str) -> None:
-    """Raises ValueError that names the first edge with `bad` True."""
+def _refuse(bad: Any, ids: Array, what: str) -> None:
+    """Raises an error that names the first edge with `bad` True."""
     if bad.any():
         e = int(np.argmax(bad))
-        pair = f" ({ids[e, 0]}, {ids[e, 1]})" if _known(ids) else ""
+        pair = f" ({ids[e, 0]}, {ids[e, 1]})" if is_concrete(ids) else ""
         more = int(bad.sum()) - 1
         others = f" (and {more} more)" if more else ""
-        raise ValueError(f"edge {e}{pair}{others}: {what}")
+        raise EdgeError(f"edge {e}{pair}{others}: {what}", e)
 
 
 def _check_ids_values(ids: Array, valid: Array, num_poses: int) -> None:
-    if not (_known(ids) and _known(valid)):
+    if not (is_concrete(ids) and is_concrete(valid)):
         return
     i, m = np.asarray(ids), np.asarray(valid)
     outside = ((i < 0) | (i >= num_poses)).any(axis=1) & m
@@ -242,7 +252,7 @@ def _check_ids_values(ids: Array, valid: Array, num_poses: int) -> None:
 
 
 def _check_motions(motions: Array, ids: Array, valid: Array) -> Array:
-    if not (_known(motions) and _known(valid)) or not motions.shape[0]:
+    if not (is_concrete(motions) and is_concrete(valid)) or not motions.shape[0]:
         return motions
     T, m = np.asarray(motions, dtype=np.float64), np.asarray(valid)
     T = np.where(m[:, None, None], T, np.eye(T.shape[-1]))
@@ -271,7 +281,7 @@ def _check_motions(motions: Array, ids: Array, valid: Array) -> Array:
 
 
 def _check_weights(weights: Array | None, ids: Array, valid: Array) -> None:
-    if weights is None or not (_known(weights) and _known(valid)):
+    if weights is None or not (is_concrete(weights) and is_concrete(valid)):
         return
     w, m = np.asarray(weights), np.asarray(valid)
     _refuse((w < 0) & m, ids, "weight is negative.")
@@ -279,7 +289,11 @@ def _check_weights(weights: Array | None, ids: Array, valid: Array) -> None:
 
 
 def _check_information(info: Array | None, ids: Array, valid: Array) -> None:
-    if info is None or not (_known(info) and _known(valid)) or not info.shape[0]:
+    if (
+        info is None
+        or not (is_concrete(info) and is_concrete(valid))
+        or not info.shape[0]
+    ):
         return
     M, m = np.asarray(info, dtype=np.float64), np.asarray(valid)
     M = np.where(m[:, None, None], M, 0)

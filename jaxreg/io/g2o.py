@@ -1,0 +1,260 @@
+"""Pose graphs in g2o text files: SE2 and SE3, any ids, also compressed by gzip.
+
+An edge line `i j` holds `T_i_j`, quaternions are xyzw, and its upper triangle is the
+information of the right tangent error (translation first). As GTSAM and SE-Sync do,
+the rotational part is taken to be that of the rotation vector.
+"""
+
+import collections
+import gzip
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import EdgeError, PoseGraph
+from jaxreg.io.atomic import atomic_write
+from jaxreg.io.errors import InputError
+from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
+
+
+_VERTEX = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
+_EDGE = {"EDGE_SE2": 9, "EDGE_SE3:QUAT": 28}
+
+
+class _Rows(NamedTuple):
+    """Lines of one kind: their numbers in the file, ids and values."""
+
+    line: np.ndarray
+    ids: np.ndarray
+    values: np.ndarray
+
+
+class _File(NamedTuple):
+    ids: np.ndarray
+    vertices: _Rows
+    edges: _Rows
+    dim: int
+
+
+def read_g2o(path: str | Path) -> PoseGraph:
+    """Reads the edges of a g2o file.
+
+    Args:
+        path: a `.g2o` file, or `.g2o.gz`, of one dimension.
+
+    Returns:
+        The graph, with information matrices. Its frames are the ids of the file in
+        increasing order, see `read_g2o_poses`; FIX lines are not needed, as frame 0 is
+        the one that stays. Lines of unknown kinds are skipped, with one warning that
+        counts them.
+
+    Raises:
+        InputError: for a file that cannot be read or a line that makes no sense, which
+            the message names.
+    """
+    file = _parse(Path(path))
+    if not len(file.edges.line):
+        raise InputError(f"{path}: holds no EDGE_SE2 or EDGE_SE3:QUAT line.")
+    d = file.dim
+    k = lie.tangent_dim(d)
+    num = d + 1 if d == 2 else 7
+    T_i_j = _motions(file.edges, d, path)
+    upper = file.edges.values[:, num:]
+    information = np.zeros((len(upper), k, k))
+    rows, columns = np.triu_indices(k)
+    information[:, rows, columns] = upper
+    information[:, columns, rows] = upper
+    edges = np.searchsorted(file.ids, file.edges.ids)
+    try:
+        return PoseGraph.from_edges(
+            edges, T_i_j, num_poses=len(file.ids), information=information
+        )
+    except EdgeError as err:
+        line = file.edges.line[err.edge]
+        raise InputError(f"{path}, line {line}: {err}") from err
+
+
+def read_g2o_poses(
+    path: str | Path,
+) -> tuple[np.ndarray, Float[Array, "v D D"] | None]:
+    """Reads the ids and the poses (initial guesses) of a g2o file.
+
+    Returns:
+        `(v,)` ids of the frames in increasing order, those named by edges alone
+        included, and `(v, d+1, d+1)` poses, or None unless each frame has a VERTEX
+        line.
+
+    Raises:
+        InputError: as `read_g2o`.
+    """
+    file = _parse(Path(path))
+    T = _motions(file.vertices, file.dim, path)
+    where = np.searchsorted(file.ids, file.vertices.ids[:, 0])
+    if len(np.unique(where)) != len(where):
+        raise InputError(f"{path}: a vertex id occurs twice.")
+    if len(where) != len(file.ids):
+        return file.ids, None
+    poses = np.empty_like(T)
+    poses[where] = T
+    return file.ids, jnp.asarray(poses, dtype=jnp.result_type(float))
+
+
+def write_g2o(
+    path: str | Path,
+    graph: PoseGraph,
+    T_world_i: Float[Array, "v D D"] | None = None,
+    ids: np.ndarray | None = None,
+) -> None:
+    """Writes poses and edges; the file appears whole or not at all.
+
+    Masked edges are left out. The information written is that of the graph (the
+    identity if it has none) times the prior weight.
+
+    Args:
+        path: the file to write; a name ending in `.gz` is compressed.
+        graph: the relative motions.
+        T_world_i: `(v, d+1, d+1)` poses, or None for no VERTEX lines.
+        ids: `(v,)` names of the frames, None for 0, 1, 2, ...
+
+    Raises:
+        ValueError: if `T_world_i` or `ids` do not belong to the graph.
+        InputError: if the folder cannot be written.
+    """
+    d, num = graph.dim, graph.num_poses
+    names = np.arange(num) if ids is None else np.asarray(ids)
+    if names.shape != (num,):
+        raise ValueError(f"ids: wanted shape {(num,)}, found {names.shape}.")
+    digits = 9 if graph.T_i_j.dtype == jnp.float32 else 17
+    lines = []
+    if T_world_i is not None:
+        poses = np.asarray(T_world_i, dtype=np.float64)
+        if poses.shape != (num, d + 1, d + 1):
+            raise ValueError(
+                f"T_world_i: wanted shape {(num, d + 1, d + 1)}, found {poses.shape}."
+            )
+        lines += _lines(list(_VERTEX)[d - 2], names[:, None], _columns(poses), digits)
+    keep = np.asarray(graph.mask)
+    k = lie.tangent_dim(d)
+    weight = np.asarray(graph.weight, dtype=np.float64)[keep, None, None]
+    info = (
+        np.eye(k) if graph.information is None else np.asarray(graph.information)[keep]
+    )
+    upper = (weight * info)[:, *np.triu_indices(k)]
+    motions = _columns(np.asarray(graph.T_i_j, dtype=np.float64)[keep])
+    values = np.concatenate([motions, upper], axis=1)
+    lines += _lines(
+        list(_EDGE)[d - 2], names[np.asarray(graph.edges)[keep]], values, digits
+    )
+    text = "\n".join(lines) + "\n"
+    with atomic_write(path, "wb") as file:
+        data = text.encode()
+        file.write(gzip.compress(data) if Path(path).suffix == ".gz" else data)
+
+
+def _columns(T: np.ndarray) -> np.ndarray:
+    if T.shape[-1] == 3:
+        angle = np.arctan2(T[:, 1, 0], T[:, 0, 0])
+        return np.concatenate([T[:, :2, 2], angle[:, None]], axis=1)
+    return np.concatenate([T[:, :3, 3], xyzw_from_rotations(T[:, :3, :3])], axis=1)
+
+
+def _lines(tag: str, ids: np.ndarray, values: np.ndarray, digits: int) -> list[str]:
+    form = " ".join([f"%.{digits}g"] * values.shape[1])
+    return [
+        f"{tag} {' '.join(map(str, name))} {form % tuple(row)}"
+        for name, row in zip(ids.tolist(), values.tolist(), strict=True)
+    ]
+
+
+def _parse(path: Path) -> _File:
+    try:
+        opened = gzip.open(path, "rt") if path.suffix == ".gz" else open(path)
+        with opened as stream:
+            lines = stream.read().splitlines()
+    except (OSError, EOFError, UnicodeDecodeError) as err:
+        reason = getattr(err, "strerror", None) or err
+        raise InputError(f"{path}: cannot be read ({reason}).") from err
+    found: dict[str, list[tuple[int, list[str]]]] = collections.defaultdict(list)
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            found[words[0]].append((number, words[1:]))
+    unknown = {
+        tag: len(rows)
+        for tag, rows in found.items()
+        if tag not in _VERTEX and tag not in _EDGE and tag != "FIX"
+    }
+    if unknown:
+        counts = ", ".join(f"{n} x {tag}" for tag, n in unknown.items())
+        warnings.warn(
+            f"{path}: skipped lines of unknown kinds ({counts}).", stacklevel=3
+        )
+    dims = [d for d in (2, 3) if any(f"SE{d}" in tag for tag in found)]
+    if len(dims) != 1:
+        what = "2D and 3D lines in one file" if dims else "no SE2 or SE3 line"
+        raise InputError(f"{path}: {what}; this is no pose graph.")
+    d = dims[0]
+    vertex, edge = list(_VERTEX)[d - 2], list(_EDGE)[d - 2]
+    vertices = _rows(path, vertex, found[vertex], 1, _VERTEX[vertex])
+    edges = _rows(path, edge, found[edge], 2, _EDGE[edge])
+    ids = np.unique(np.concatenate([vertices.ids.ravel(), edges.ids.ravel()]))
+    return _File(ids, vertices, edges, d)
+
+
+def _rows(
+    path: Path, tag: str, rows: list[tuple[int, list[str]]], num_ids: int, num: int
+) -> _Rows:
+    for number, words in rows:
+        if len(words) != num_ids + num:
+            raise InputError(
+                f"{path}, line {number}: {tag} wants {num_ids + num} numbers, "
+                f"found {len(words)}. Is the file cut off?"
+            )
+    lines = np.array([number for number, _ in rows], dtype=np.int64)
+    try:
+        ids = np.array([words[:num_ids] for _, words in rows], dtype=np.int64)
+        values = np.array([words[num_ids:] for _, words in rows], dtype=np.float64)
+    except (ValueError, OverflowError):
+        raise _first_bad_number(path, rows, num_ids) from None
+    values = values.reshape(-1, num)
+    bad = ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        raise InputError(
+            f"{path}, line {lines[np.argmax(bad)]}: {tag} holds a number that is not "
+            "finite."
+        )
+    return _Rows(lines, ids.reshape(-1, num_ids), values)
+
+
+def _first_bad_number(
+    path: Path, rows: list[tuple[int, list[str]]], num_ids: int
+) -> InputError:
+    for number, words in rows:
+        for at, word in enumerate(words):
+            try:
+                int(word) if at < num_ids else float(word)
+            except ValueError:
+                kind = "an integer id" if at < num_ids else "a number"
+                return InputError(f"{path}, line {number}: {word!r} is not {kind}.")
+    return InputError(f"{path}: an id does not fit into 64 bits.")
+
+
+def _motions(rows: _Rows, d: int, path: str | Path) -> np.ndarray:
+    values = rows.values
+    if d == 3:
+        short = np.linalg.norm(values[:, 3:7], axis=1) < 1e-6
+        if short.any():
+            raise InputError(
+                f"{path}, line {rows.line[np.argmax(short)]}: the quaternion is zero."
+            )
+        return motions_from_xyzw(values[:, :3], values[:, 3:7])
+    T = np.tile(np.eye(3), (len(values), 1, 1))
+    c, s = np.cos(values[:, 2]), np.sin(values[:, 2])
+    T[:, :2, :2] = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    T[:, :2, 2] = values[:, :2]
+    return T
