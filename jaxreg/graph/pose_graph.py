@@ -1,6 +1,6 @@
 """`PoseGraph`: relative motions between frames, the input of motion averaging."""
 
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -51,7 +51,7 @@ class PoseGraph(eqx.Module):
         weight: object = None,
         information: object = None,
         mask: object = None,
-    ) -> Self:
+    ) -> "PoseGraph":
         """Checks relative motions and makes a graph of them.
 
         Args:
@@ -99,12 +99,12 @@ class PoseGraph(eqx.Module):
         )
         return graph._cleaned() if num else graph.padded(1)
 
-    def _cleaned(self) -> Self:
+    def _cleaned(self) -> "PoseGraph":
         """The graph with harmless values in the masked rows."""
         eye = jnp.eye(self.T_i_j.shape[-1], dtype=self.T_i_j.dtype)
         keep = self.mask[:, None, None]
         info = self.information
-        return type(self)(
+        return PoseGraph(
             edges=jnp.where(self.mask[:, None], self.edges, 0),
             T_i_j=jnp.where(keep, self.T_i_j, eye),
             weight=jnp.where(self.mask, self.weight, 0),
@@ -113,7 +113,7 @@ class PoseGraph(eqx.Module):
             num_poses=self.num_poses,
         )
 
-    def padded(self, num_edges: int) -> Self:
+    def padded(self, num_edges: int) -> "PoseGraph":
         """The same graph with masked edges appended up to `num_edges`.
 
         Args:

@@ -189,15 +189,19 @@ def shortest_path_poses(
     start = jnp.full((num_poses,), jnp.inf, T_i_j.dtype).at[0].set(0)
     reach, _ = jax.lax.while_loop(lambda s: s[1], relax, (start, jnp.asarray(True)))
     reached = jnp.isfinite(reach)
+    # The parent is the best neighbour that is strictly nearer: no cycles by rounding.
+    via_i = jnp.where(reach[i] < reach[j], reach[i] + length, jnp.inf)
+    via_j = jnp.where(reach[j] < reach[i], reach[j] + length, jnp.inf)
+    best = (
+        jnp.full((num_poses,), jnp.inf, T_i_j.dtype).at[j].min(via_i).at[i].min(via_j)
+    )
     num_edges = edges.shape[0]
     order = jnp.arange(num_edges, dtype=jnp.int32)
-    to_j = jnp.where(present & (reach[i] + length == reach[j]), order, 2 * num_edges)
-    to_i = jnp.where(
-        present & (reach[j] + length == reach[i]), order + num_edges, 2 * num_edges
-    )
-    code = jnp.full((num_poses,), 2 * num_edges, jnp.int32).at[j].min(to_j)
-    code = code.at[i].min(to_i).at[0].set(2 * num_edges)
-    has = code < 2 * num_edges
+    none = 2 * num_edges
+    to_j = jnp.where(jnp.isfinite(via_i) & (via_i == best[j]), order, none)
+    to_i = jnp.where(jnp.isfinite(via_j) & (via_j == best[i]), order + num_edges, none)
+    code = jnp.full((num_poses,), none, jnp.int32).at[j].min(to_j).at[i].min(to_i)
+    has = code < none
     backward = code >= num_edges
     e = jnp.where(has, jnp.where(backward, code - num_edges, code), 0)
     frames = jnp.arange(num_poses, dtype=jnp.int32)

@@ -107,8 +107,8 @@ def read_g2o_poses(
 def write_g2o(
     path: str | Path,
     graph: PoseGraph,
-    T_world_i: Float[Array, "v D D"] | None = None,
-    ids: np.ndarray | None = None,
+    T_world_i: object = None,
+    ids: object = None,
 ) -> None:
     """Writes poses and edges; the file appears whole or not at all.
 

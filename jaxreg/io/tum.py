@@ -13,8 +13,8 @@ from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
 
 def write_tum(
     path: str | Path,
-    T_world_i: Float[Array, "v D D"],
-    timestamps: np.ndarray | None = None,
+    T_world_i: object,
+    timestamps: object = None,
 ) -> None:
     """Writes poses as a trajectory; the file appears whole or not at all.
 

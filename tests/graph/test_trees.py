@@ -1,0 +1,117 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jaxreg.graph import trees
+
+
+V, E = 12, 30
+maximum = jax.jit(trees.maximum_spanning_tree, static_argnums=3)
+shortest = jax.jit(trees.shortest_path_poses, static_argnums=3)
+components = jax.jit(trees.components, static_argnums=2)
+
+
+def random_case(seed: int, present: float = 1.0):
+    """Random edges (with repeats) of consistent motions, and the poses behind them."""
+    rng = np.random.default_rng(seed)
+    X = np.tile(np.eye(4), (V, 1, 1))
+    X[:, :3, :3] = Rotation.random(V, random_state=seed).as_matrix()
+    X[:, :3, 3] = rng.normal(size=(V, 3))
+    X = np.linalg.inv(X[0]) @ X
+    i = rng.integers(0, V, E)
+    edges = np.stack([i, (i + rng.integers(1, V, E)) % V], axis=1).astype(np.int32)
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]]
+    weight = rng.uniform(0.1, 1, E) * (rng.uniform(size=E) < present)
+    return X, edges, T.astype(np.float32), weight.astype(np.float32)
+
+
+def scipy_components(edges: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    keep = weight > 0
+    graph = sp.coo_matrix(
+        (np.ones(keep.sum()), (edges[keep, 0], edges[keep, 1])), (V, V)
+    )
+    return sp.csgraph.connected_components(graph, directed=False)[1]
+
+
+def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool(((a[:, None] == a) == (b[:, None] == b)).all())
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([0.0, 0.2, 0.5, 1.0]))
+def test_forest_is_that_of_scipy_and_poses_are_exact(seed, present):
+    X, edges, T, weight = random_case(seed, present)
+    forest = maximum(edges, T, weight, V)
+    labels = scipy_components(edges, weight)
+    component = components(edges, weight, V)
+    assert same_partition(np.asarray(component), labels)
+    assert same_partition(np.asarray(forest.component), labels)
+    assert all(
+        component[v] == min(np.flatnonzero(labels == labels[v])) for v in range(V)
+    )
+    np.testing.assert_array_equal(forest.reached, labels == labels[0])
+    in_tree = np.asarray(forest.in_tree)
+    assert in_tree.sum() == V - len(set(labels))
+    # SciPy keeps one of parallel edges: build its input from the heaviest.
+    dense = np.zeros((V, V))
+    for (i, j), w in zip(edges, weight, strict=True):
+        dense[i, j] = dense[j, i] = max(dense[i, j], w)
+    cost = np.where(np.triu(dense) > 0, 2 - np.triu(dense), 0)
+    tree = sp.csgraph.minimum_spanning_tree(cost)
+    best = (2 - tree.data).sum() if tree.nnz else 0
+    np.testing.assert_allclose(weight[in_tree].sum(), best, rtol=1e-5)
+    expected = np.where((labels == labels[0])[:, None, None], X, np.eye(4))
+    np.testing.assert_allclose(forest.T_world_i, expected, atol=2e-5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([0.2, 0.5, 1.0]))
+def test_shortest_paths_reach_what_is_connected_exactly(seed, present):
+    X, edges, T, weight = random_case(seed, present)
+    poses, reached = shortest(edges, T, weight, V)
+    labels = scipy_components(edges, weight)
+    np.testing.assert_array_equal(reached, labels == labels[0])
+    expected = np.where((labels == labels[0])[:, None, None], X, np.eye(4))
+    np.testing.assert_allclose(poses, expected, atol=2e-5)
+
+
+def test_paths_are_those_of_least_variance():
+    # 0-1-2 of variance 1 each against a direct edge of variance 3, then of 1.5.
+    T = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    T[:, 0, 3] = [1, 1, 10]
+    edges = jnp.array([[0, 1], [1, 2], [0, 2]], jnp.int32)
+    for direct, expected in ((3.0, 2.0), (1.5, 10.0)):
+        weight = np.float32([1, 1, 1 / direct])
+        poses, _ = trees.shortest_path_poses(
+            edges, jnp.asarray(T), jnp.asarray(weight), 3
+        )
+        np.testing.assert_allclose(poses[2, 0, 3], expected)
+
+
+def test_ties_go_to_the_earlier_edge_and_direction_does_not_matter():
+    T = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    T[:, 0, 3] = [1, 5, -2]
+    edges = jnp.array([[0, 1], [0, 1], [2, 1]], jnp.int32)
+    forest = trees.maximum_spanning_tree(edges, jnp.asarray(T), jnp.ones(3), 3)
+    np.testing.assert_allclose(forest.T_world_i[:, 0, 3], [0, 1, 3])
+    np.testing.assert_array_equal(forest.in_tree, [True, False, True])
+
+
+def test_batches_and_long_chains():
+    X, edges, T, weight = random_case(3)
+    batch = jax.vmap(lambda w: maximum(edges, T, w, V).T_world_i)
+    both = batch(jnp.stack([weight, weight[::-1]]))
+    np.testing.assert_allclose(both[0], X, atol=2e-5)
+    num = 2000
+    chain = np.stack([np.arange(num - 1), np.arange(1, num)], axis=1).astype(np.int32)
+    steps = np.tile(np.eye(4, dtype=np.float32), (num - 1, 1, 1))
+    steps[:, 0, 3] = 1
+    ones = jnp.ones(num - 1)
+    poses = maximum(chain, steps, ones, num).T_world_i
+    np.testing.assert_array_equal(poses[:, 0, 3], np.arange(num))
+    np.testing.assert_array_equal(components(chain, ones, num), 0)
+    np.testing.assert_array_equal(shortest(chain, steps, ones, num)[0], poses)
