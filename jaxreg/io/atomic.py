@@ -70,11 +70,17 @@ def atomic_folder(folder: str | Path) -> Iterator[Path]:
     """
     folder = Path(folder)
     require_writable(folder)
+    made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".jaxreg-", dir=folder) as staging:
-        yield Path(staging)
-        for file in sorted(Path(staging).iterdir()):
-            os.replace(file, folder / file.name)
+    try:
+        with tempfile.TemporaryDirectory(prefix=".jaxreg-", dir=folder) as staging:
+            yield Path(staging)
+            for file in sorted(Path(staging).iterdir()):
+                os.replace(file, folder / file.name)
+    except BaseException:
+        if made:
+            folder.rmdir()
+        raise
 
 
 def require_writable(folder: str | Path) -> None:

@@ -80,7 +80,7 @@ def read_scans(
                 found = {key or stem(bare): read_points(file)}
             names += found.keys()
             scans += found.values()
-    return _unique(names), scans
+    return unique_names(names), scans
 
 
 def stem(path: str | Path) -> str:
@@ -196,7 +196,8 @@ def _natural(name: str) -> list[tuple[int, int | str]]:
     return [(0, int(p)) if p.isdigit() else (1, p) for p in parts if p]
 
 
-def _unique(names: list[str]) -> list[str]:
+def unique_names(names: list[str]) -> list[str]:
+    """The same names, later ones of a kind with -2, -3 and so on appended."""
     seen: dict[str, int] = {}
     out: list[str] = []
     for name in names:

@@ -41,7 +41,7 @@ def reconstruction_figure(
         InputError: if the file cannot be written.
         MissingExtraError: if matplotlib is not installed.
     """
-    figure_module = _matplotlib_figure()
+    module = figure_module()
     keep = np.ones(len(scans), bool) if placed is None else np.asarray(placed, bool)
     stride = 1 + sum(len(s) for s in scans) // _MAX_POINTS
     before = [s[np.isfinite(s).all(axis=1)][::stride].astype(float) for s in scans]
@@ -51,14 +51,14 @@ def reconstruction_figure(
     ]
     colors = scan_colors(len(scans))
     solid = before[0].shape[1] == 3
-    figure = figure_module.Figure(figsize=(13, 4.9) if solid else (10, 4.9), dpi=130)
+    figure = module.Figure(figsize=(13, 4.9) if solid else (10, 4.9), dpi=130)
     axes = figure.subplots(1, 3 if solid else 2)
     if solid:
         _draw_solid(axes, before, after, keep, colors)
     else:
         _draw_flat(axes, before, after, keep, colors)
     for axis in axes:
-        axis.set_aspect("equal")
+        axis.set_aspect("equal", adjustable="datalim")
         axis.set_axis_off()
     _legend(figure, names, keep, colors)
     figure.subplots_adjust(left=0.01, right=0.99, top=0.91, bottom=0.13, wspace=0.04)
@@ -77,8 +77,8 @@ def _draw_solid(
 ) -> None:
     model = [x for x, k in zip(after, keep, strict=True) if k]
     model_colors = colors[keep]
-    axes_of_model, centre = _principal_axes(np.concatenate(model))
-    camera = _tilt(20, 25) @ axes_of_model
+    axes_of_model, centre = principal_axes(np.concatenate(model))
+    camera = tilt(20, 25) @ axes_of_model
     # The first panel sees the frames as they came, about their common middle.
     middle = np.median(np.concatenate(before), axis=0)
     _show(axes[0], [(x - middle) @ camera.T for x in before], colors)
@@ -114,7 +114,7 @@ def _show(axis: Any, parts: list[np.ndarray], colors: np.ndarray) -> None:
     axis.imshow(image, extent=extent, interpolation="antialiased")
 
 
-def _principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A rotation whose rows are right, up and towards the viewer, and the centre."""
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     _, vectors = np.linalg.eigh(np.cov(points.T))
@@ -125,7 +125,8 @@ def _principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([right, up, np.cross(right, up)]), centre
 
 
-def _tilt(elevation_deg: float, azimuth_deg: float) -> np.ndarray:
+def tilt(elevation_deg: float, azimuth_deg: float) -> np.ndarray:
+    """A rotation that turns an object about its up axis, then its top to the viewer."""
     a, e = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
     turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
     nod = np.array([[1, 0, 0], [0, np.cos(e), -np.sin(e)], [0, np.sin(e), np.cos(e)]])
@@ -165,7 +166,12 @@ def _legend(
     )
 
 
-def _matplotlib_figure() -> ModuleType:
+def figure_module() -> ModuleType:
+    """Matplotlib's figures, without its global state.
+
+    Raises:
+        MissingExtraError: if matplotlib is not installed.
+    """
     try:
         import matplotlib.figure
     except ModuleNotFoundError as err:

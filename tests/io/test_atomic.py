@@ -48,7 +48,8 @@ def test_folder_gets_all_files_or_none(tmp_path: Path):
     out = tmp_path / "new" / "out"
     with pytest.raises(FileNotFoundError), atomic_folder(out) as staging:
         (staging / "first").write_text((tmp_path / "none").read_text())
-    assert os.listdir(out) == []
+    assert not out.exists()
+    out.mkdir()
     (out / "first").write_text("old")
     with atomic_folder(out) as staging:
         (staging / "first").write_text("1")

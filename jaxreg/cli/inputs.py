@@ -1,0 +1,96 @@
+"""Scans for the commands: read, checked, and moved near the origin."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jaxreg.io.errors import InputError
+from jaxreg.io.points import read_scans, unique_names
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Scans as they were read, and where each came from.
+
+    Attributes:
+        names: unique names.
+        points: `(n_i, d)` arrays, rows with NaN or inf included.
+        places: file, and key or file name within, for messages.
+    """
+
+    names: list[str]
+    points: list[np.ndarray]
+    places: list[str]
+
+    def centred(self) -> tuple[list[np.ndarray], np.ndarray]:
+        """Scans moved to their own middles, and these, `(v, d)` float64.
+
+        Map coordinates of seven digits before the point are thereby cut to float32
+        without loss: the subtraction is in float64.
+        """
+        middles = [
+            np.median(x[np.isfinite(x).all(axis=1)].astype(np.float64), axis=0)
+            for x in self.points
+        ]
+        moved = [
+            (x.astype(np.float64) - c).astype(np.float32)
+            for x, c in zip(self.points, middles, strict=True)
+        ]
+        return moved, np.stack(middles)
+
+
+def load_scans(paths: Sequence[Path]) -> Scans:
+    """Reads the scans of a command line and refuses what cannot be registered.
+
+    Raises:
+        InputError: if a file cannot be read, there are fewer than two scans, 2D and 3D
+            are mixed, or a scan has fewer than d + 1 distinct finite points.
+    """
+    names: list[str] = []
+    points: list[np.ndarray] = []
+    places: list[str] = []
+    for path in paths:
+        found, arrays = read_scans(path)
+        names += found
+        points += arrays
+        alone = len(found) == 1 and not path.is_dir()
+        places += [str(path) if alone else f"{path} ({name})" for name in found]
+    scans = Scans(unique_names(names), points, places)
+    _require_two(scans)
+    _require_one_dimension(scans)
+    for place, array in zip(scans.places, scans.points, strict=True):
+        _require_points(place, array)
+    return scans
+
+
+def _require_two(scans: Scans) -> None:
+    if len(scans.names) < 2:
+        raise InputError(
+            f"{scans.places[0]}: this is one scan alone.\n"
+            "Give two or more: several files, a folder, or an NPZ file of scans."
+        )
+
+
+def _require_one_dimension(scans: Scans) -> None:
+    first = scans.points[0].shape[1]
+    for place, array in zip(scans.places, scans.points, strict=True):
+        if array.shape[1] != first:
+            raise InputError(
+                f"{place}: is {array.shape[1]}D, but {scans.places[0]} is {first}D.\n"
+                "Register 2D scans and 3D scans apart."
+            )
+
+
+def _require_points(place: str, array: np.ndarray) -> None:
+    finite = array[np.isfinite(array).all(axis=1)]
+    wanted = array.shape[1] + 1
+    distinct = len(np.unique(finite[:10_000], axis=0))
+    if distinct < wanted:
+        distinct = len(np.unique(finite, axis=0))
+    if distinct < wanted:
+        raise InputError(
+            f"{place}: holds {distinct} distinct finite points of {len(array)} rows, "
+            f"at least {wanted} are needed.\nExport the scan again, or leave it out."
+        )

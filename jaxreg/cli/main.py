@@ -1,0 +1,59 @@
+"""Entry point of the command `jaxreg`: parses, dispatches, and speaks of errors.
+
+Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted.
+"""
+
+import shlex
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+
+from jaxreg.io.errors import InputError, MissingExtraError
+from jaxreg.io.result import version
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+        argv: arguments without the program's name; None for those of the process.
+
+    Returns:
+        The exit code.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments in (["--version"], ["-V"]):
+        sys.stdout.write(f"jaxreg {version('jaxreg')}\n")
+        return 0
+    try:
+        return _run(arguments)
+    except (InputError, MissingExtraError) as err:
+        sys.stderr.write(f"jaxreg: {err}\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write("jaxreg: interrupted; no results were written.\n")
+        return 130
+
+
+def _run(arguments: list[str]) -> int:
+    # All of them now: nobody wants to learn it when the results are to be written.
+    for package in ("tyro", "rich", "plyfile", "matplotlib"):
+        if find_spec(package) is None:
+            raise MissingExtraError(package, "The command line")
+    import tyro
+
+    from jaxreg.cli import commands, runtime
+
+    command = tyro.cli(
+        commands.COMMANDS,
+        prog="jaxreg",
+        description=(
+            "Registers 2D and 3D point sets rigidly, without an initial guess, and "
+            "brings many scans into one frame."
+        ),
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    runtime.keep_compiled_programs()
+    line = shlex.join(["jaxreg", *arguments])
+    return command.run(runtime.Session(command, line))

@@ -1,0 +1,158 @@
+"""From solutions to results in the frames of the files; the tables on the screen."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from jaxreg._core.status import Status
+from jaxreg.cli.runtime import Session
+from jaxreg.io.atomic import atomic_folder
+from jaxreg.io.result import Result, result_document, write_result
+from jaxreg.metrics import rotation_errors, translation_errors
+from jaxreg.plot.figure import reconstruction_figure
+
+
+def uncentre(
+    T: np.ndarray, to_middle: np.ndarray, from_middle: np.ndarray
+) -> np.ndarray:
+    """Motions between centred scans as motions between the scans themselves.
+
+    Args:
+        T: `(b, d+1, d+1)` maps one centred frame into another.
+        to_middle: `(b, d)` or `(d,)` middle of the scan that it maps to.
+        from_middle: `(b, d)` or `(d,)` middle of the scan that it maps from.
+
+    Returns:
+        `(b, d+1, d+1)` float64, the rotations orthonormal to float64; NaN where `T` is
+        not finite.
+    """
+    out = np.array(T, dtype=np.float64)
+    finite = np.isfinite(out).all(axis=(1, 2))
+    out[~finite] = np.eye(out.shape[-1])
+    U, _, Vt = np.linalg.svd(out[:, :-1, :-1])
+    R = U @ Vt
+    out[:, :-1, :-1] = R
+    turned = np.einsum(
+        "bij,bj->bi", R, np.broadcast_to(from_middle, out[:, :-1, -1].shape)
+    )
+    out[:, :-1, -1] += to_middle - turned
+    out[~finite] = np.nan
+    return out
+
+
+def write_files(
+    session: Session,
+    result: Result,
+    scans: Sequence[np.ndarray],
+    errors: dict[str, Any] | None = None,
+) -> None:
+    """Writes all files of a result into the folder of `--out`, or none."""
+    with atomic_folder(session.options.out) as staging:
+        with session.timed("write"):
+            reconstruction_figure(
+                staging / "figure.png",
+                scans,
+                result.T_world_i,
+                result.names,
+                result.placed,
+            )
+        document = result_document(
+            result,
+            command=session.command,
+            seed=session.options.seed,
+            times={k: round(v, 3) for k, v in session.times.items()},
+            errors=errors,
+        )
+        write_result(staging, result, scans, document)
+
+
+def pose_errors(
+    result: Result, names: Sequence[str], T_true_i: np.ndarray
+) -> dict[str, Any]:
+    """Errors against true poses, the first placed scan being brought to its truth.
+
+    Args:
+        result: poses.
+        names: the scans of which the truth is known.
+        T_true_i: `(len(names), d+1, d+1)` true poses.
+
+    Returns:
+        `names`, `e_R` (radians) and `e_t` (unit of the scans) of each placed scan with
+        known truth, and their means `mean_e_R`, `mean_e_t` as in the MCC paper.
+    """
+    row = {name: k for k, name in enumerate(names)}
+    known = [
+        i for i, name in enumerate(result.names) if result.placed[i] and name in row
+    ]
+    truth = T_true_i[[row[result.names[i]] for i in known]]
+    # Relative to the first of them, so that float32 meets no large common offset.
+    estimate = _relative(result.T_world_i[known])
+    T_est, T_true = jnp.asarray(estimate, float), jnp.asarray(_relative(truth), float)
+    e_R = np.asarray(rotation_errors(T_est, T_true), dtype=np.float64)
+    e_t = np.asarray(translation_errors(T_est, T_true), dtype=np.float64)
+    return {
+        "names": [result.names[i] for i in known],
+        "e_R": e_R.tolist(),
+        "e_t": e_t.tolist(),
+        "mean_e_R": float(e_R.mean()),
+        "mean_e_t": float(e_t.mean()),
+    }
+
+
+def show_scans(session: Session, result: Result) -> None:
+    """Prints a line for each scan and one for the whole."""
+    table = Table(title="Scans", title_justify="left")
+    for name in ("scan", "points", "dropped", "status", "best pair", "overlap"):
+        table.add_column(name, justify="left" if "s" == name[0] else "right")
+    for i, name in enumerate(result.names):
+        row = result.best_pair(i)
+        pair = "" if row is None else result.names[result.partner(i, row)]
+        overlap = "" if row is None else f"{result.overlap[row]:.2f}"
+        status = Status(int(result.scan_status[i])).name
+        table.add_row(
+            name,
+            f"{result.num_points[i]:,}",
+            f"{result.num_dropped[i]:,}",
+            status if result.placed[i] else f"{status}, not placed",
+            pair,
+            overlap,
+        )
+    session.console.print(table)
+    trusted = int(np.sum(result.weight > 0.5))
+    session.console.print(
+        f"{result.status.name}: {int(result.placed.sum())} of {len(result.names)} "
+        f"scans placed, {trusted} of {len(result.edges)} pairs trusted."
+    )
+    if result.status != Status.CONVERGED:
+        session.console.print(result.status.advice)
+
+
+def show_errors(session: Session, errors: dict[str, Any]) -> None:
+    """Prints the errors against the truth, lengths in millimetres (scans in metres)."""
+    table = Table(title="Errors against the truth", title_justify="left")
+    table.add_column("scan")
+    table.add_column("e_R [rad]", justify="right")
+    table.add_column("e_t [mm]", justify="right")
+    rows = zip(errors["names"], errors["e_R"], errors["e_t"], strict=True)
+    for name, e_R, e_t in rows:
+        table.add_row(name, f"{e_R:.5f}", f"{1e3 * e_t:.3f}")
+    table.add_section()
+    table.add_row(
+        "mean", f"{errors['mean_e_R']:.5f}", f"{1e3 * errors['mean_e_t']:.3f}"
+    )
+    session.console.print(table)
+
+
+def show_end(session: Session, files: Sequence[str], folder: Path) -> None:
+    """Prints what took how long and what was written."""
+    parts = ", ".join(f"{name} {s:.1f} s" for name, s in session.times.items())
+    session.console.print(f"Times: {parts}.")
+    session.console.print(f"Written to {folder}: {', '.join(files)}.")
+
+
+def _relative(T: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(T[0]) @ T

@@ -1,0 +1,97 @@
+"""`jaxreg register`: one scan onto another."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import tyro
+
+from jaxreg._core.status import Status
+from jaxreg.cli import outputs
+from jaxreg.cli.inputs import Scans, load_scans
+from jaxreg.cli.multiview import FILES
+from jaxreg.cli.runtime import Options, Session
+from jaxreg.io.atomic import require_writable
+from jaxreg.io.errors import InputError
+from jaxreg.io.result import Result
+
+
+@dataclass(frozen=True)
+class Register(Options):
+    """Move one scan onto another, without an initial guess."""
+
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
+    """The scan that moves: PLY, XYZ, CSV, TXT, NPY, or FILE.npz:KEY."""
+    target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
+    """The scan that stays; its frame is that of the result."""
+
+    def run(self, session: Session) -> int:
+        """Runs the command; returns the exit code."""
+        with session.timed("read"):
+            scans = load_scans([self.target, self.source])
+        if len(scans.names) != 2:
+            raise InputError(
+                f"{self.target} and {self.source}: hold {len(scans.names)} scans.\n"
+                "Name one of each (FILE.npz:KEY), or use: jaxreg multiview"
+            )
+        require_writable(self.out)
+        key = self.key()
+        with session.progress() as progress, session.timed("run", computes=True):
+            progress("registering", 0, 1)
+            result = _register(scans, key)
+            progress("registering", 1, 1)
+        if not result.placed[1]:
+            raise InputError(
+                f"{self.source} onto {self.target}: {result.status.name}.\n"
+                f"{result.status.advice}"
+            )
+        outputs.write_files(session, result, scans.points)
+        _show(session, result)
+        return 0
+
+
+def _register(scans: Scans, key: jax.Array) -> Result:
+    import jaxreg
+
+    centred, middles = scans.centred()
+    target, source = (x[np.isfinite(x).all(axis=1)] for x in centred)
+    sol = jaxreg.register(source, target, key=key)
+    status = Status(int(sol.status))
+    found = status in (Status.CONVERGED, Status.MAX_STEPS, Status.AMBIGUOUS)
+    T_target_source = outputs.uncentre(
+        np.asarray(sol.T_target_source)[None], middles[0], middles[1]
+    )
+    rows = np.array([len(x) for x in scans.points])
+    return Result(
+        names=scans.names,
+        T_world_i=np.stack([np.eye(len(T_target_source[0])), T_target_source[0]]),
+        placed=np.array([True, found]),
+        status=status,
+        scan_status=np.array([Status.CONVERGED, status]),
+        num_points=rows,
+        num_dropped=rows - [len(target), len(source)],
+        edges=np.array([[0, 1]]),
+        T_i_j=T_target_source,
+        overlap=np.array([float(sol.fitness)]),
+        weight=np.array([float(found)]),
+        inlier_rmse=np.array([float(sol.inlier_rmse)]),
+    )
+
+
+def _show(session: Session, result: Result) -> None:
+    target, source = result.names
+    session.console.print(
+        f"{result.status.name}: {source} lies on {target} with overlap "
+        f"{result.overlap[0]:.3f} and inlier RMSE {result.inlier_rmse[0]:.4g}."
+    )
+    if result.status != Status.CONVERGED:
+        session.console.print(result.status.advice)
+    dropped = int(result.num_dropped.sum())
+    if dropped:
+        session.console.print(f"{dropped:,} rows with NaN or inf were left out.")
+    session.console.print(f"T_{target}_{source} =")
+    for row in result.T_world_i[1]:
+        session.console.print("  " + " ".join(f"{x:14.9g}" for x in row))
+    outputs.show_end(session, FILES, session.options.out)

@@ -1,0 +1,122 @@
+"""What every command shares: options, the screen, the clock, the compilation cache."""
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from jaxreg._core.typing import Progress as ProgressCall
+from jaxreg.io.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of every command."""
+
+    out: Path = Path("jaxreg-out")
+    """Folder for the results; made if needed."""
+    seed: int = 0
+    """Of the random numbers; the same seed gives the same result."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+    def key(self) -> jax.Array:
+        """The key that the seed stands for."""
+        if not 0 <= self.seed < 2**31:
+            raise InputError(f"--seed {self.seed}: wanted a number from 0 to 2^31 - 1.")
+        return jax.random.key(self.seed)
+
+
+class Session:
+    """One run of a command: where it writes to, and how long its parts took."""
+
+    def __init__(self, options: Options, command: str):
+        self.options = options
+        self.command = command
+        self.times: dict[str, float] = {}
+        self.console = Console(quiet=options.quiet, highlight=False)
+
+    @contextlib.contextmanager
+    def timed(self, part: str, computes: bool = False) -> Iterator[None]:
+        """Adds the seconds of the block; compilation is told apart if it `computes`."""
+        compiled, start = _COMPILE_CLOCK.seconds, time.perf_counter()
+        yield
+        total = time.perf_counter() - start
+        if computes:
+            compiling = min(_COMPILE_CLOCK.seconds - compiled, total)
+            self.times["compile"] = self.times.get("compile", 0.0) + compiling
+            total -= compiling
+        self.times[part] = self.times.get(part, 0.0) + total
+
+    @contextlib.contextmanager
+    def progress(self) -> Iterator[ProgressCall]:
+        """A live display of stages; silent if quiet or if nobody watches."""
+        with Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=28),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            disable=self.options.quiet or not Console(stderr=True).is_terminal,
+        ) as display:
+            tasks: dict[str, TaskID] = {}
+
+            def call(stage: str, done: int, total: int) -> None:
+                if stage not in tasks:
+                    tasks[stage] = display.add_task(f"{stage:<24}", total=total)
+                display.update(tasks[stage], completed=done, total=total)
+
+            yield call
+
+
+def keep_compiled_programs() -> None:
+    """Turns on JAX's cache of compiled programs, in the user's cache folder.
+
+    `JAX_COMPILATION_CACHE_DIR` is honoured, then `XDG_CACHE_HOME`. Must be called
+    before the first compilation.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(root) / "jaxreg"
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+class _CompileClock:
+    """Seconds that JAX spent tracing, lowering and compiling in this process."""
+
+    _EVENTS = (
+        "/jax/core/compile/jaxpr_trace_duration",
+        "/jax/core/compile/jaxpr_to_mlir_module_duration",
+        "/jax/core/compile/backend_compile_duration",
+    )
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._hear)
+
+    def _hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event in self._EVENTS:
+            self.seconds += duration_secs
+
+
+_COMPILE_CLOCK = _CompileClock()

@@ -1,0 +1,255 @@
+"""The files of a result: result.json, poses.tum, graph.g2o, merged.ply.
+
+A `Result` is what a reconstruction or registration found, on the host and in float64,
+in the frames and unit of the files that were read.
+"""
+
+import json
+import math
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxreg._core.status import Status
+from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.io.atomic import atomic_write
+from jaxreg.io.colors import scan_colors
+from jaxreg.io.g2o import write_g2o
+from jaxreg.io.ply import write_ply
+from jaxreg.io.tum import write_tum
+
+
+MAX_MERGED_POINTS = 2_000_000
+
+
+@dataclass(frozen=True)
+class Result:
+    """Poses of scans and the pairs that they rest on.
+
+    Attributes:
+        names: of the `v` scans.
+        T_world_i: `(v, d+1, d+1)` float64 poses.
+        placed: `(v,)` False where the pose means nothing.
+        status: of the whole.
+        scan_status: `(v,)` of each scan.
+        num_points: `(v,)` rows read.
+        num_dropped: `(v,)` rows with NaN or inf, which were left out.
+        edges: `(e, 2)` the pairs i, j that were evaluated.
+        T_i_j: `(e, d+1, d+1)` float64, maps scan j into the frame of scan i.
+        overlap: `(e,)` share of the points that have a partner.
+        weight: `(e,)` final trust, 0 to 1.
+        inlier_rmse: `(e,)` in the unit of the scans.
+    """
+
+    names: list[str]
+    T_world_i: np.ndarray
+    placed: np.ndarray
+    status: Status
+    scan_status: np.ndarray
+    num_points: np.ndarray
+    num_dropped: np.ndarray
+    edges: np.ndarray
+    T_i_j: np.ndarray
+    overlap: np.ndarray
+    weight: np.ndarray
+    inlier_rmse: np.ndarray
+
+    def best_pair(self, scan: int) -> int | None:
+        """The row of the pair of this scan that overlaps most, None without pairs."""
+        rows = np.flatnonzero((self.edges == scan).any(axis=1))
+        return int(rows[np.argmax(self.overlap[rows])]) if len(rows) else None
+
+    def partner(self, scan: int, row: int) -> int:
+        """The other scan of a pair."""
+        i, j = self.edges[row]
+        return int(j if i == scan else i)
+
+
+def result_document(
+    result: Result,
+    *,
+    command: str,
+    seed: int,
+    times: dict[str, float],
+    errors: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """What result.json holds: plain lists and numbers, null for what has no value.
+
+    Args:
+        result: poses and pairs.
+        command: the command line that made it.
+        seed: of the random numbers.
+        times: seconds by name.
+        errors: against a known truth, or None.
+    """
+    document = {
+        "command": command,
+        "seed": seed,
+        "status": result.status.name,
+        "advice": result.status.advice,
+        "names": result.names,
+        "T_world_i": [
+            T.tolist() if ok else None
+            for T, ok in zip(result.T_world_i, result.placed, strict=True)
+        ],
+        "scans": [_scan_entry(result, i) for i in range(len(result.names))],
+        "pairs": [_pair_entry(result, e) for e in range(len(result.edges))],
+        "times_s": times,
+        "versions": versions(),
+    }
+    return document if errors is None else {**document, "errors": errors}
+
+
+def write_json(path: str | Path, document: dict[str, Any]) -> None:
+    """Writes a document as JSON; numbers that are not finite become null."""
+    with atomic_write(path) as file:
+        json.dump(_finite(document), file, indent=1, allow_nan=False)
+        file.write("\n")
+
+
+def write_result(
+    folder: str | Path,
+    result: Result,
+    scans: Sequence[np.ndarray],
+    document: dict[str, Any],
+) -> None:
+    """Writes result.json, poses.tum, graph.g2o and merged.ply into an existing folder.
+
+    Scans that are not placed are in result.json alone. In poses.tum the timestamp, in
+    graph.g2o the id is the number of the scan. graph.g2o holds the pairs that are
+    trusted, the information being the trust times the identity.
+
+    Raises:
+        InputError: if a file cannot be written.
+        MissingExtraError: if plyfile is not installed.
+    """
+    folder = Path(folder)
+    write_json(folder / "result.json", document)
+    points, owner = merge_scans(scans, result.T_world_i, result.placed)
+    colors = scan_colors(len(scans))[owner]
+    write_ply(folder / "merged.ply", points, colors)
+    ids = np.flatnonzero(result.placed)
+    # Files keep the digits of float64 whatever the precision of the computation.
+    with jax.enable_x64(True):
+        T_world_i = jnp.asarray(result.T_world_i[ids])
+        write_tum(folder / "poses.tum", T_world_i, timestamps=ids)
+        write_g2o(folder / "graph.g2o", _trusted_graph(result, ids), T_world_i, ids)
+
+
+def merge_scans(
+    scans: Sequence[np.ndarray],
+    T_world_i: np.ndarray,
+    placed: np.ndarray,
+    max_points: int = MAX_MERGED_POINTS,
+) -> tuple[np.ndarray, np.ndarray]:
+    """All placed scans in the common frame.
+
+    Above `max_points` one point per cube is kept, the cubes being as small as that
+    number allows within a factor of 1.25.
+
+    Returns:
+        `(n, d)` points, float32 if all scans are, else float64, and `(n,)` the scan
+        that each comes from. Rows with NaN or inf are left out.
+    """
+    parts, owner = [], []
+    for k, (scan, T) in enumerate(zip(scans, T_world_i, strict=True)):
+        if placed[k]:
+            finite = scan[np.isfinite(scan).all(axis=1)].astype(np.float64)
+            parts.append(finite @ T[:-1, :-1].T + T[:-1, -1])
+            owner.append(np.full(len(finite), k))
+    points, owners = np.concatenate(parts), np.concatenate(owner)
+    if len(points) > max_points:
+        keep = _thin(points, max_points)
+        points, owners = points[keep], owners[keep]
+    narrow = all(s.dtype == np.float32 for s in scans)
+    return points.astype(np.float32 if narrow else np.float64), owners
+
+
+def version(package: str) -> str:
+    """The version of an installed package; a bare source tree has none."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on, and the device."""
+    found = {name: version(name) for name in ("jaxreg", "jax", "jaxlib", "numpy")}
+    device = jax.devices()[0]
+    return {
+        **found,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "device": f"{device.platform} {device.device_kind}",
+    }
+
+
+def _scan_entry(result: Result, i: int) -> dict[str, Any]:
+    status = Status(int(result.scan_status[i]))
+    row = result.best_pair(i)
+    best = None if row is None else _pair_entry(result, row, motion=False)
+    return {
+        "name": result.names[i],
+        "placed": bool(result.placed[i]),
+        "status": status.name,
+        "advice": status.advice,
+        "num_points": int(result.num_points[i]),
+        "num_dropped": int(result.num_dropped[i]),
+        "best_pair": best,
+    }
+
+
+def _pair_entry(result: Result, e: int, motion: bool = True) -> dict[str, Any]:
+    i, j = (int(k) for k in result.edges[e])
+    entry: dict[str, Any] = {
+        "i": result.names[i],
+        "j": result.names[j],
+        "overlap": float(result.overlap[e]),
+        "weight": float(result.weight[e]),
+        "inlier_rmse": float(result.inlier_rmse[e]),
+    }
+    return {**entry, "T_i_j": result.T_i_j[e].tolist()} if motion else entry
+
+
+def _trusted_graph(result: Result, ids: np.ndarray) -> PoseGraph:
+    number = np.full(len(result.names), -1)
+    number[ids] = np.arange(len(ids))
+    edges = number[result.edges]
+    keep = (edges >= 0).all(axis=1) & (result.weight > 1e-6)
+    return PoseGraph.from_edges(
+        edges[keep],
+        result.T_i_j[keep],
+        num_poses=len(ids),
+        weight=result.weight[keep],
+    )
+
+
+def _thin(points: np.ndarray, max_points: int) -> np.ndarray:
+    low = points.min(axis=0)
+    extent = float(np.ptp(points, axis=0).max())
+    size = extent / 4096
+    while True:
+        cell = ((points - low) / size).astype(np.int64)
+        strides = np.cumprod([1, *(cell.max(axis=0)[:-1] + 1)])
+        _, first = np.unique(cell @ strides, return_index=True)
+        if len(first) <= max_points:
+            return np.sort(first)
+        size *= 1.25
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
