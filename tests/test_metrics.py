@@ -12,9 +12,10 @@ from tests.helpers import data_dir
 
 
 def random_poses(seed: int, num: int = 7) -> np.ndarray:
+    rng = np.random.default_rng(seed)
     T = np.tile(np.eye(4), (num, 1, 1))
-    T[:, :3, :3] = Rotation.random(num, random_state=seed).as_matrix()
-    T[:, :3, 3] = np.random.default_rng(seed).normal(size=(num, 3))
+    T[:, :3, :3] = Rotation.from_quat(rng.normal(size=(num, 4))).as_matrix()
+    T[:, :3, 3] = rng.normal(size=(num, 3))
     return T
 
 

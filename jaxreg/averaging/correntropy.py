@@ -45,10 +45,11 @@ class Correntropy(AbstractAverager):
     kernel width and the start are cut.
     """
 
-    alpha: Array = traced(1.0)
+    width: Literal["paper"] = eqx.field(static=True, default="paper")
+    alpha: Array | float = traced(1.0)
     rows: Literal["sqrt", "weight"] = eqx.field(static=True, default="sqrt")
     max_steps: int = eqx.field(static=True, default=100)
-    tolerance: Array = traced(1e-8)
+    tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = SpanningTree()
 
     def __check_init__(self) -> None:

@@ -66,7 +66,7 @@ def iterate(
     rows_of: RowsOf,
     *,
     max_steps: int,
-    tolerance: Float[Array, ""],
+    tolerance: Array | float,
 ) -> Iterated:
     """Alternates weights and weighted averaging until the poses stand still.
 

@@ -70,6 +70,7 @@ def laplacian(
 class _Preconditioner(NamedTuple):
     blocks: Array  # (b, s, s) inverses of the diagonal blocks
     coarse: Array  # (b, b) inverse of the Galerkin matrix
+    held: Array  # (v, 1) 1 for the frames that some weight holds, 0 for frame 0
 
     def __call__(self, r: Array) -> Array:
         num_poses, k = r.shape
@@ -78,7 +79,7 @@ class _Preconditioner(NamedTuple):
         fine = self.blocks @ padded
         lift = self.coarse @ jnp.sum(padded, axis=1)
         both = fine + lift[:, None, :]
-        return both.reshape(b * s, k)[:num_poses].at[0].set(0)
+        return both.reshape(b * s, k)[:num_poses] * self.held
 
 
 def _precondition(edges: Array, weight: Array, num_poses: int) -> _Preconditioner:
@@ -98,7 +99,9 @@ def _precondition(edges: Array, weight: Array, num_poses: int) -> _Preconditione
     ground = jnp.sum(jnp.where((i == 0) | (j == 0), weight, 0))
     blocks = blocks.at[0, 0, 0].add(ground)
     coarse = coarse.at[0, 0].add(ground)
-    return _Preconditioner(_ridged_inverse(blocks), _ridged_inverse(coarse))
+    touched = jnp.zeros((num_poses,), weight.dtype).at[i].add(weight).at[j].add(weight)
+    held = (touched > 0).at[0].set(False).astype(weight.dtype)[:, None]
+    return _Preconditioner(_ridged_inverse(blocks), _ridged_inverse(coarse), held)
 
 
 def _ridged_inverse(A: Array) -> Array:

@@ -32,7 +32,7 @@ class MotionAveraging(AbstractAverager):
     """
 
     max_steps: int = eqx.field(static=True, default=50)
-    tolerance: Array = traced(1e-8)
+    tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = SpanningTree(by="path")
 
     def solve(
@@ -65,7 +65,7 @@ class WeightedMotionAveraging(AbstractAverager):
 
     rows: Literal["sqrt", "weight"] = eqx.field(static=True, default="sqrt")
     max_steps: int = eqx.field(static=True, default=50)
-    tolerance: Array = traced(1e-8)
+    tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = SpanningTree(by="path")
 
     def __check_init__(self) -> None:
@@ -106,7 +106,7 @@ def _least_squares(
     T_start: Float[Array, "v D D"],
     rows: RowsOf,
     max_steps: int,
-    tolerance: Array,
+    tolerance: Array | float,
 ) -> AveragingSolution:
     def no_width(g: PoseGraph, T: Array) -> Array:
         return jnp.full((2,), jnp.inf, T.dtype)

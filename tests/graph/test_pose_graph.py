@@ -13,9 +13,10 @@ EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 1]])
 
 
 def motions(seed: int = 0, num: int = 4) -> np.ndarray:
+    rng = np.random.default_rng(seed)
     T = np.tile(np.eye(4), (num, 1, 1))
-    T[:, :3, :3] = Rotation.random(num, random_state=seed).as_matrix()
-    T[:, :3, 3] = np.random.default_rng(seed).normal(size=(num, 3))
+    T[:, :3, :3] = Rotation.from_quat(rng.normal(size=(num, 4))).as_matrix()
+    T[:, :3, 3] = rng.normal(size=(num, 3))
     return T
 
 

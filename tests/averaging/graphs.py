@@ -1,0 +1,65 @@
+"""Random graphs with known poses and outliers, in NumPy and SciPy."""
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial.transform import Rotation
+
+
+def motions(R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    d = t.shape[-1]
+    T = np.tile(np.eye(d + 1), (len(t), 1, 1))
+    T[:, :d, :d], T[:, :d, d] = R, t
+    return T
+
+
+def rotations(rng: np.random.Generator, num: int, d: int, sigma: float | None):
+    """Uniform rotations, or small ones of standard deviation sigma (radians)."""
+    if d == 2:
+        a = (
+            rng.uniform(-np.pi, np.pi, num)
+            if sigma is None
+            else sigma * rng.normal(size=num)
+        )
+        return np.moveaxis(
+            np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]), -1, 0
+        )
+    if sigma is None:
+        return Rotation.from_quat(rng.normal(size=(num, 4))).as_matrix()
+    return Rotation.from_rotvec(sigma * rng.normal(size=(num, 3))).as_matrix()
+
+
+def random_graph(
+    num: int,
+    num_edges: int,
+    outliers: float,
+    seed: int,
+    *,
+    d: int = 3,
+    noise: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """True poses, edges, motions and outlier flags.
+
+    Noise is 0.5 degrees and 0.5 % of the size (1); outlier motions are uniformly
+    random; the inlier edges connect all poses.
+    """
+    rng = np.random.default_rng(seed)
+    X = motions(rotations(rng, num, d, None), rng.uniform(-0.5, 0.5, (num, d)))
+    X = np.linalg.inv(X[0]) @ X
+    pairs = np.stack(np.triu_indices(num, 1), axis=1)
+    while True:
+        edges = pairs[np.sort(rng.choice(len(pairs), num_edges, replace=False))]
+        bad = np.zeros(num_edges, bool)
+        bad[rng.choice(num_edges, round(outliers * num_edges), replace=False)] = True
+        i, j = edges[~bad].T
+        graph = sp.coo_matrix((np.ones(len(i)), (i, j)), (num, num))
+        if sp.csgraph.connected_components(graph, directed=False)[0] == 1:
+            break
+    error = motions(
+        rotations(rng, num_edges, d, noise * np.deg2rad(0.5)),
+        noise * 0.005 * rng.normal(size=(num_edges, d)),
+    )
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ error
+    wild = motions(
+        rotations(rng, num_edges, d, None), rng.uniform(-1, 1, (num_edges, d))
+    )
+    return X, edges, np.where(bad[:, None, None], wild, T), bad

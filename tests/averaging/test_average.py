@@ -1,0 +1,299 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm, logm
+
+from jaxreg._core.status import Status
+from jaxreg.averaging import (
+    AveragingSolution,
+    Correntropy,
+    MotionAveraging,
+    SpanningTree,
+    WeightedMotionAveraging,
+    average,
+)
+from jaxreg.averaging.correntropy import gaussian_trust
+from jaxreg.averaging.iterate import iterate
+from jaxreg.averaging.plain import scaled_rows
+from jaxreg.graph import PoseGraph
+from jaxreg.metrics import rotation_error, translation_error
+from tests.averaging.graphs import random_graph
+
+
+N, H = 12, 60
+METHODS = {
+    "tree": SpanningTree(),
+    "paths": SpanningTree(by="path"),
+    "plain": MotionAveraging(),
+    "weighted": WeightedMotionAveraging(),
+    "correntropy": Correntropy(width="paper"),
+}
+
+
+def single(X, edges, T, weight=None, **kwargs) -> PoseGraph:
+    return PoseGraph.from_edges(edges, T.astype(np.float32), len(X), weight, **kwargs)
+
+
+def errors(solution: AveragingSolution, X: np.ndarray) -> tuple[float, float]:
+    true = jnp.asarray(X, solution.T_world_i.dtype)
+    T = solution.T_world_i
+    return float(rotation_error(T, true)), float(translation_error(T, true))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("name", METHODS)
+def test_exact_motions_are_recovered_exactly_at_any_gauge(name, d):
+    X, edges, T, _ = random_graph(N, H, 0.0, 0, d=d, noise=0.0)
+    graph = single(X, edges, T)
+    solution = average(graph, METHODS[name])
+    assert solution.status == Status.CONVERGED
+    assert max(errors(solution, X)) < 1e-5
+    assert solution.residual < 1e-5
+    assert solution.T_world_i.dtype == jnp.float32
+    np.testing.assert_array_equal(solution.T_world_i[0], np.eye(d + 1))
+    np.testing.assert_allclose(solution.edge_weight, 1, atol=0.8)
+    gauge = X[3] @ X
+    moved = average(graph, METHODS[name], init=gauge)
+    np.testing.assert_allclose(moved.T_world_i, gauge, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", ["plain", "correntropy"])
+def test_order_direction_and_unit_of_the_motions_do_not_matter(name):
+    X, edges, T, bad = random_graph(N, H, 0.1, 1)
+    with jax.enable_x64(True):
+        method = METHODS[name]
+        init = X + 0.0
+        base = average(PoseGraph.from_edges(edges, T), method, init=init)
+        order = np.random.default_rng(0).permutation(H)
+        swapped = np.where(
+            (order % 2 == 0)[:, None], edges[order][:, ::-1], edges[order]
+        )
+        inverted = np.where(
+            (order % 2 == 0)[:, None, None], np.linalg.inv(T[order]), T[order]
+        )
+        other = average(PoseGraph.from_edges(swapped, inverted), method, init=init)
+        # Swapping i and j changes Eq. 22 only by which end measures the translation.
+        tolerance = 1e-6 if name == "plain" else 2e-3
+        np.testing.assert_allclose(other.T_world_i, base.T_world_i, atol=tolerance)
+        mm = np.diag([1e3, 1e3, 1e3, 1])
+        scaled = mm @ T @ np.linalg.inv(mm)
+        start = mm @ init @ np.linalg.inv(mm)
+        other = average(PoseGraph.from_edges(edges, scaled), method, init=start)
+        np.testing.assert_allclose(
+            other.T_world_i, mm @ base.T_world_i @ np.linalg.inv(mm), atol=1e-6
+        )
+        np.testing.assert_allclose(other.edge_weight, base.edge_weight, atol=1e-8)
+        np.testing.assert_allclose(other.residual, base.residual, rtol=1e-8)
+
+
+def vec(T: np.ndarray) -> np.ndarray:
+    m = np.real(logm(T))
+    return np.array([*m[:3, 3], m[2, 1], m[0, 2], m[1, 0]])
+
+
+def rvec(v: np.ndarray) -> np.ndarray:
+    m = np.zeros((4, 4))
+    m[:3, 3] = v[:3]
+    m[2, 1], m[0, 2], m[1, 0] = v[3:]
+    return expm(m - np.pad(m[:3, :3].T, (0, 1)))
+
+
+@pytest.mark.parametrize("rows", ["sqrt", "weight"])
+@pytest.mark.parametrize("kind", ["weighted", "correntropy"])
+def test_one_step_against_the_stacked_system_of_the_paper(rows, kind):
+    X, edges, T, _ = random_graph(N, H, 0.1, 2)
+    rng = np.random.default_rng(0)
+    init = np.stack([rvec(0.05 * rng.normal(size=6)) @ x for x in X])
+    init = np.linalg.inv(init[0]) @ init
+    prior = rng.uniform(0.5, 2, H)
+    with jax.enable_x64(True):
+        graph = PoseGraph.from_edges(edges, T, weight=prior)
+        if kind == "weighted":
+            method = WeightedMotionAveraging(rows=rows, max_steps=1)
+        else:
+            method = Correntropy(width="paper", alpha=0.8, rows=rows, max_steps=1)
+        solution = average(graph, method, init=init)
+    w = prior.copy()
+    if kind == "correntropy":
+        scale = float(solution.length_scale)
+        gaps = T - np.linalg.inv(init[edges[:, 0]]) @ init[edges[:, 1]]
+        gaps[:, :3, 3] /= scale
+        e = np.sqrt((gaps**2).sum((1, 2)))
+        sigma = 0.8 * (prior * e).sum() / prior.sum()
+        w = prior * np.exp(-(e**2) / (2 * sigma**2))
+    row = np.sqrt(w) if rows == "sqrt" else w
+    D, dV = np.zeros((6 * H, 6 * N)), np.zeros(6 * H)
+    for h, (i, j) in enumerate(edges):
+        at = slice(6 * h, 6 * h + 6)
+        D[at, 6 * i : 6 * i + 6] = -row[h] * np.eye(6)
+        D[at, 6 * j : 6 * j + 6] = row[h] * np.eye(6)
+        dV[at] = row[h] * vec(init[i] @ T[h] @ np.linalg.inv(init[j]))
+    A = np.linalg.lstsq(D[:, 6:], dV, rcond=None)[0].reshape(-1, 6)
+    expected = np.stack([rvec(a) @ M for a, M in zip(A, init[1:], strict=True)])
+    np.testing.assert_allclose(solution.T_world_i[1:], expected, atol=2e-6)
+
+
+def test_ten_percent_of_outliers_hardly_matter():
+    """The median over seeds is near that of the oracle that knows the inliers."""
+    cases = [random_graph(N, H, 0.1, seed) for seed in range(10)]
+    robust, oracle = [], []
+    for X, edges, T, bad in cases:
+        graph = single(X, edges, T)
+        start = X.astype(np.float32)
+        robust.append(errors(average(graph, METHODS["correntropy"], start), X))
+        kept = single(X, edges, T, mask=~bad)
+        oracle.append(errors(average(kept, METHODS["plain"], start), X))
+    ratio = np.median(robust, axis=0) / np.median(oracle, axis=0)
+    assert (ratio < 1.15).all(), ratio
+
+
+def test_edge_weights_name_the_outliers():
+    X, edges, T, bad = random_graph(N, H, 0.1, 3)
+    solution = average(single(X, edges, T), METHODS["correntropy"], X)
+    weight = np.asarray(solution.edge_weight)
+    assert weight[bad].max() < weight[~bad].min()
+    assert "trusted" in repr(solution)
+
+
+def test_batches_agree_with_single_graphs():
+    cases = [random_graph(N, H, 0.1, seed) for seed in range(3)]
+    graphs = [single(X, edges, T) for X, edges, T, _ in cases]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *graphs)
+    for name in ("plain", "correntropy"):
+        many = jax.vmap(lambda g: average(g, METHODS[name]))(batch)  # noqa: B023
+        assert many.status.shape == (3,)
+        for lane, graph in enumerate(graphs):
+            one = average(graph, METHODS[name])
+            np.testing.assert_allclose(many.T_world_i[lane], one.T_world_i, atol=1e-4)
+
+
+def test_gradients_agree_with_differences():
+    X, edges, T, _ = random_graph(N, H, 0.05, 4)
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        graph = PoseGraph.from_edges(edges, T, weight=rng.uniform(0.5, 1.5, H))
+        probe = rng.normal(size=(N, 4, 4))
+        init, width = jnp.asarray(X), jnp.array([0.05, 0.05])
+
+        @jax.jit
+        def value(T, weight):
+            g = PoseGraph.from_edges(edges, T, N, weight)
+            end = iterate(
+                g,
+                init,
+                lambda g, T: width,
+                gaussian_trust,
+                scaled_rows("sqrt"),
+                max_steps=200,
+                tolerance=jnp.asarray(1e-12),
+            )
+            return jnp.sum(probe * end.T_world_i)
+
+        by_T, by_weight = jax.grad(value, argnums=(0, 1))(graph.T_i_j, graph.weight)
+        dT = np.zeros_like(T)
+        dT[:, :3, 3] = rng.normal(size=(H, 3))
+        dw = rng.normal(size=H)
+        h = 1e-6
+        up = value(graph.T_i_j + h * dT, graph.weight + h * dw)
+        down = value(graph.T_i_j - h * dT, graph.weight - h * dw)
+        slope = jnp.sum(by_T * dT) + jnp.sum(by_weight * dw)
+        np.testing.assert_allclose((up - down) / (2 * h), slope, rtol=1e-5)
+
+
+def test_gradients_are_finite_without_noise_and_follow_the_gauge():
+    X, edges, T, _ = random_graph(N, H, 0.0, 4, noise=0.0)
+    start = jnp.asarray(X, jnp.float32)
+
+    @jax.grad
+    def slope(args):
+        T, weight, init = args
+        graph = PoseGraph.from_edges(edges, T, N, weight)
+        return jnp.sum(average(graph, METHODS["correntropy"], init=init).T_world_i ** 2)
+
+    by = slope((jnp.asarray(T, jnp.float32), jnp.ones(H), start))
+    assert all(np.isfinite(x).all() for x in by)
+    assert np.abs(by[0]).max() > 0
+    assert np.abs(by[2][0]).max() > 0
+    assert np.abs(by[2][1:]).max() == 0
+
+
+def test_parts_that_hang_apart_are_told():
+    X, edges, T, _ = random_graph(N, H, 0.0, 5, noise=0.0)
+    cut = (edges < 8).all(axis=1) | (edges >= 8).all(axis=1)
+    graph = single(X, edges, T, mask=cut)
+    for name in ("tree", "paths", "plain", "correntropy"):
+        solution = average(graph, METHODS[name])
+        assert solution.status == Status.DISCONNECTED
+        np.testing.assert_array_equal(solution.placed, np.arange(N) < 8)
+        np.testing.assert_allclose(solution.T_world_i[:8], X[:8], atol=1e-5)
+        np.testing.assert_array_equal(
+            solution.T_world_i[8:], np.eye(4)[None].repeat(4, axis=0)
+        )
+    zero = single(X, edges, T, weight=cut.astype(np.float32))
+    assert average(zero, METHODS["plain"]).status == Status.DISCONNECTED
+
+
+def test_numbers_that_are_not_finite_cost_their_edge_alone():
+    X, edges, T, _ = random_graph(N, H, 0.0, 6, noise=0.0)
+
+    @jax.jit
+    def solve(T, init):
+        graph = PoseGraph.from_edges(edges, T, N)
+        return average(graph, METHODS["plain"], init=init)
+
+    broken = T.astype(np.float32)
+    broken[7] = np.nan
+    start = X.astype(np.float32)
+    solution = solve(broken, start)
+    assert solution.status == Status.NON_FINITE
+    np.testing.assert_allclose(solution.T_world_i, X, atol=1e-5)
+    assert solution.edge_weight[7] == 0
+    start[4] = np.inf
+    solution = solve(T.astype(np.float32), start)
+    assert solution.status == Status.NON_FINITE
+    np.testing.assert_allclose(solution.T_world_i, X, atol=1e-5)
+
+
+def test_one_pose_no_edges_and_running_out_of_steps():
+    empty = PoseGraph.from_edges([], np.zeros((0, 4, 4), np.float32), num_poses=1)
+    for name in ("tree", "paths", "plain", "correntropy"):
+        solution = average(empty, METHODS[name])
+        assert solution.status == Status.CONVERGED
+        np.testing.assert_array_equal(solution.T_world_i[0], np.eye(4))
+    X, edges, T, _ = random_graph(N, H, 0.1, 7)
+    solution = average(single(X, edges, T), MotionAveraging(max_steps=1))
+    assert solution.status == Status.MAX_STEPS
+    assert solution.num_steps == 1
+
+
+def test_wrong_arguments_are_named():
+    X, edges, T, _ = random_graph(N, H, 0.0, 0)
+    graph = single(X, edges, T)
+    with pytest.raises(ValueError, match=r"init: wanted shape \(12, 4, 4\)"):
+        average(graph, init=X[:3])
+
+
+def test_settings_do_not_recompile_and_solutions_are_arrays():
+    X, edges, T, _ = random_graph(N, H, 0.1, 0)
+    graph = single(X, edges, T)
+    traces = []
+
+    @jax.jit
+    def solve(graph, method):
+        traces.append(None)
+        return average(graph, method)
+
+    for alpha in (0.5, 1.0, 2.0):
+        solution = solve(graph, Correntropy(width="paper", alpha=alpha))
+    assert len(traces) == 1
+    assert all(isinstance(x, jax.Array) for x in jax.tree.leaves(solution))
+
+
+def test_single_precision_stays_single_with_double_enabled():
+    X, edges, T, _ = random_graph(N, H, 0.1, 0)
+    with jax.enable_x64(True):
+        for name in ("tree", "plain", "correntropy"):
+            solution = average(single(X, edges, T), METHODS[name])
+            floats = [x.dtype for x in jax.tree.leaves(solution) if x.dtype.kind == "f"]
+            assert set(floats) == {np.dtype(np.float32)}
