@@ -1,0 +1,85 @@
+"""The contract of registration methods and what they return."""
+
+import abc
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxreg._core.status import Status
+from jaxreg._core.typing import Key, Mask, Motion, Points
+from jaxreg.cloud import PointCloud
+
+
+class Modes(eqx.Module):
+    """Distinct poses that the search ended in, best first.
+
+    Attributes:
+        T_target_source: `(q, d+1, d+1)`.
+        weight: `(q,)` share of the posterior; zero marks an unused row.
+        fitness: `(q,)` as in the solution.
+    """
+
+    T_target_source: Float[Array, "*b q D D"]
+    weight: Float[Array, "*b q"]
+    fitness: Float[Array, "*b q"]
+
+
+class RegistrationSolution(eqx.Module):
+    """The pose of a source in the frame of a target, and how far to trust it.
+
+    Attributes:
+        T_target_source: `(d+1, d+1)` maps source coordinates to target coordinates.
+        status: int32, see `Status`.
+        fitness: share of the source that lies on the target at this pose.
+        inlier_rmse: root mean square distance of that share to the target's tangent
+            planes, in the unit of the input.
+        overlap: the lesser of the shares of source and target that lie on the other.
+        num_steps: int32, steps of the local optimiser along the winning path.
+        modes: distinct poses with weights; one for a local method.
+    """
+
+    T_target_source: Float[Array, "*b D D"]
+    status: Int[Array, "*b"]
+    fitness: Float[Array, "*b"]
+    inlier_rmse: Float[Array, "*b"]
+    overlap: Float[Array, "*b"]
+    num_steps: Int[Array, "*b"]
+    modes: Modes
+
+    def __repr__(self) -> str:
+        """One line: status, fitness, residual."""
+        if isinstance(self.status, Array) and self.status.ndim == 0:
+            try:
+                status = Status(int(self.status)).name
+                return (
+                    f"RegistrationSolution({status}, "
+                    f"fitness={float(self.fitness):.3f}, "
+                    f"overlap={float(self.overlap):.3f}, "
+                    f"inlier_rmse={float(self.inlier_rmse):.4g})"
+                )
+            except TypeError:  # a tracer has a shape but no value
+                pass
+        return f"RegistrationSolution(batch={np.shape(self.status)})"
+
+
+class AbstractRegistrar(eqx.Module):
+    """A method for `register`.
+
+    `solve` works in frames prepared by `register`: both clouds centred at their
+    centroids and scaled so that the target's root mean square radius is one.
+    """
+
+    @abc.abstractmethod
+    def prepare(self, points: Points, mask: Mask) -> PointCloud:
+        """The cloud that `solve` expects: thinned, with normals."""
+
+    @abc.abstractmethod
+    def solve(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        init: Motion | None,
+        key: Key | None,
+    ) -> RegistrationSolution:
+        """Registers two prepared clouds."""

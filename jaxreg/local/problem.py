@@ -1,0 +1,107 @@
+"""What a local optimiser works on: a source, a target, and the index between them.
+
+Coordinates of the source are held as rows `(d, n)`, which XLA vectorises over points.
+The source is centred at its own centroid, so that rotation and translation decouple
+(PF paper, section 3.1); see `registration.py` for the frames around it.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.typing import Motion
+from jaxreg.cloud import PointCloud
+from jaxreg.geometry import lie
+from jaxreg.neighbours.base import AbstractIndex
+
+
+class Problem(eqx.Module):
+    """One pair of point sets, with the target indexed.
+
+    Attributes:
+        source: `(d, n)` points, centred.
+        source_normals: `(d, n)` unit normals of either sign, zero where undefined.
+        source_mask: `(n,)`.
+        target: `(m, 2d)` points and unit normals of either sign, side by side.
+        index: closest points among the target.
+    """
+
+    source: Float[Array, "d n"]
+    source_normals: Float[Array, "d n"]
+    source_mask: Bool[Array, " n"]
+    target: Float[Array, "m two_d"]
+    index: AbstractIndex
+
+    @classmethod
+    def of(
+        cls, source: PointCloud, target: PointCloud, index: AbstractIndex
+    ) -> "Problem":
+        """The problem of two clouds; `index` was built on the target's points."""
+        return cls(
+            source.points.T,
+            source.normals.T,
+            source.mask,
+            jnp.concatenate([target.points, target.normals], axis=1),
+            index,
+        )
+
+
+class Match(eqx.Module):
+    """Source points under a pose beside their closest target points.
+
+    Attributes:
+        rotated: `(d, n)` R p: the lever arms of the rotation.
+        residual: `(d, n)` q - (R p + t), from the moved source to the target.
+        normal: `(d, n)` target normals.
+        agreement: `(n,)` squared cosine between the two normals, in [0, 1]; one where
+            either is undefined, zero for masked points.
+        row: `(n,)` rows in the target.
+    """
+
+    rotated: Float[Array, "d n"]
+    residual: Float[Array, "d n"]
+    normal: Float[Array, "d n"]
+    agreement: Float[Array, " n"]
+    row: Int[Array, " n"]
+
+    @property
+    def sq_residual(self) -> Float[Array, " n"]:
+        """Squared distance to the closest target point."""
+        return sum_rows(self.residual * self.residual)
+
+    @property
+    def plane_residual(self) -> Float[Array, " n"]:
+        """Signed distance to the target's tangent plane (line in 2D)."""
+        return sum_rows(self.normal * self.residual)
+
+
+def sum_rows(x: Float[Array, "d n"]) -> Float[Array, " n"]:
+    """Sum over the d coordinates, unrolled: faster than a reduction of length 3."""
+    out = x[0]
+    for k in range(1, x.shape[0]):
+        out = out + x[k]
+    return out
+
+
+def _rotate(R: Array, columns: Array) -> Array:
+    return jnp.stack([sum_rows(R[k][:, None] * columns) for k in range(R.shape[0])])
+
+
+def match(problem: Problem, T_target_source: Motion) -> Match:
+    """Closest target points of the source under a pose (PF paper, Eq. 2)."""
+    d = problem.source.shape[0]
+    R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
+    rotated = _rotate(R, problem.source)
+    moved = rotated + t[:, None]
+    row = problem.index.lookup(moved)
+    found = problem.target[row]
+    normal = jnp.stack([found[:, d + k] for k in range(d)])
+    residual = jnp.stack([found[:, k] for k in range(d)]) - moved
+    source_normal = _rotate(R, problem.source_normals)
+    cosine = sum_rows(source_normal * normal)
+    known = (sum_rows(normal * normal) > 0) & (
+        sum_rows(source_normal * source_normal) > 0
+    )
+    agreement = jnp.where(known, cosine * cosine, 1)
+    agreement = jnp.where(problem.source_mask, agreement, 0)
+    return Match(rotated, residual, normal, agreement, row)

@@ -1,0 +1,66 @@
+"""How well two clouds agree at a pose, without knowing the truth."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg._core.typing import Motion
+from jaxreg.cloud import PointCloud
+from jaxreg.geometry import lie
+from jaxreg.local.problem import Problem, match
+from jaxreg.neighbours.base import AbstractIndex
+
+
+# A point lies on the other surface if the closest sample is within this many sample
+# spacings, its plane within half a spacing, and the normals within 30 degrees.
+_REACH = 1.5
+_PLANE = 0.5
+_COSINE_SQ = 0.75
+
+
+class Score(eqx.Module):
+    """Agreement of one cloud with another: share on it and residual of that share."""
+
+    fitness: Float[Array, ""]
+    inlier_rmse: Float[Array, ""]
+
+
+def score(problem: Problem, T_target_source: Motion, spacing: Float[Array, ""]) -> Score:
+    """The share of the source that lies on the target, and its plane residual.
+
+    Args:
+        problem: source and indexed target.
+        T_target_source: the pose.
+        spacing: distance between samples of the coarser cloud.
+    """
+    found = match(problem, T_target_source)
+    plane = found.plane_residual
+    flat = jnp.any(found.normal != 0, axis=0)
+    height = jnp.where(flat, plane**2, found.sq_residual)
+    inlier = (
+        (found.sq_residual < (_REACH * spacing) ** 2)
+        & (height < (_PLANE * spacing) ** 2)
+        & (found.agreement > _COSINE_SQ)
+        & problem.source_mask
+    )
+    count = jnp.sum(inlier)
+    total = jnp.maximum(jnp.sum(problem.source_mask), 1)
+    sq = jnp.sum(jnp.where(inlier, height, 0)) / jnp.maximum(count, 1)
+    return Score((count / total).astype(sq.dtype), jnp.sqrt(sq))
+
+
+def score_both_ways(
+    source: PointCloud,
+    target: PointCloud,
+    source_index: AbstractIndex,
+    target_index: AbstractIndex,
+    T_target_source: Motion,
+    spacing: Float[Array, ""],
+) -> tuple[Score, Score]:
+    """Scores of the source on the target and of the target on the source."""
+    forward = Problem.of(source, target, target_index)
+    backward = Problem.of(target, source, source_index)
+    return (
+        score(forward, T_target_source, spacing),
+        score(backward, lie.inverse(T_target_source), spacing),
+    )

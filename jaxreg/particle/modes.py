@@ -1,0 +1,39 @@
+"""Distinct poses among particles."""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxreg._core.typing import Scalar
+from jaxreg.geometry import lie
+from jaxreg.particle.state import Particles
+
+
+def distinct_modes(
+    particles: Particles,
+    weight: Float[Array, " p"],
+    num_modes: int,
+    *,
+    angle: Scalar,
+    distance: Scalar,
+) -> tuple[Int[Array, " q"], Float[Array, " q"]]:
+    """Rows of the best particles that differ from one another, and their weights.
+
+    Greedy: the particle of least energy is a mode and takes the weight of all
+    particles within `angle` (radians) and `distance` of it; then the next among the
+    rest. Surplus modes have weight zero and repeat the first row.
+    """
+    T = particles.T_target_source
+    R, t = lie.rotation(T), lie.translation(T)
+
+    def pick(free: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+        best = jnp.argmin(jnp.where(free, particles.energy, jnp.inf))
+        turn = lie.rotation_angle(jnp.einsum("pij,kj->pik", R, R[best]))
+        shift = jnp.sqrt(jnp.sum((t - t[best]) ** 2, axis=-1))
+        same = free & (turn < angle) & (shift < distance)
+        mass = jnp.sum(jnp.where(same, weight, 0))
+        return free & ~same, (best, jnp.where(jnp.any(free), mass, 0))
+
+    free = jnp.isfinite(particles.energy)
+    _, (rows, mass) = lax.scan(pick, free, None, length=num_modes)
+    return jnp.where(mass > 0, rows, rows[0]).astype(jnp.int32), mass

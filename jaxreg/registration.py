@@ -1,0 +1,202 @@
+"""`register`: the pose of one point set in the frame of another."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jaxreg._core.checks import (
+    as_float_array,
+    check_key,
+    check_mask,
+    check_motion,
+    check_points,
+)
+from jaxreg._core.status import Status
+from jaxreg._core.typing import Key
+from jaxreg.cloud import centroid, rms_radius
+from jaxreg.geometry import lie
+from jaxreg.local import AbstractRegistrar, RegistrationSolution
+from jaxreg.particle import ParticleFilter
+
+
+def register(
+    source: object,
+    target: object,
+    method: AbstractRegistrar | None = None,
+    init: object = None,
+    key: Key | None = None,
+    *,
+    source_mask: object = None,
+    target_mask: object = None,
+) -> RegistrationSolution:
+    """Registers a source point set to a target.
+
+    Args:
+        source: `(n, d)` points, d = 2 or 3, or a batch of pairs `(..., n, d)`; what
+            `numpy.asarray` or DLPack takes.
+        target: `(m, d)` points, or a batch with the same leading axes.
+        method: `ParticleFilter()` by default, which needs no initial guess; `ICP()`
+            for a local search.
+        init: `T_target_source` to start from, `(d+1, d+1)` or one per pair, or None.
+        key: a `jax.random.key`; needed by methods that draw random numbers. A batch of
+            pairs gets one key each by splitting.
+        source_mask: `(n,)` True for valid points; rows that are not finite are masked
+            in any case.
+        target_mask: `(m,)` likewise.
+
+    Returns:
+        A `RegistrationSolution`, with leading axes for a batch.
+
+    Raises:
+        ValueError, TypeError: while tracing, for shapes, dtypes and keys that do not
+            fit, naming the argument.
+
+    Fails:
+        With the statuses of the method; TOO_FEW_POINTS where a cloud has fewer than
+        d + 1 distinct valid points, and then the pose is the identity.
+
+    Gradients:
+        As the method says.
+    """
+    method = ParticleFilter() if method is None else method
+    if not isinstance(method, AbstractRegistrar):
+        raise TypeError(
+            "method: wanted a registration method such as jaxreg.ParticleFilter() or "
+            f"jaxreg.ICP(), found {type(method).__name__}."
+        )
+    source = as_float_array(source, "source")
+    target = as_float_array(target, "target")
+    d = check_points(source, "source")
+    if check_points(target, "target") != d:
+        raise ValueError(
+            f"target: wanted points of dimension {d} like source, found shape "
+            f"{target.shape}."
+        )
+    if target.dtype != source.dtype:
+        raise TypeError(
+            f"target: wanted dtype {source.dtype} like source, found {target.dtype}."
+        )
+    batch = source.shape[:-2]
+    if target.shape[:-2] != batch:
+        raise ValueError(
+            f"target: wanted leading axes {batch} like source, found "
+            f"{target.shape[:-2]}."
+        )
+    source_mask = check_mask(source_mask, source.shape[:-1], "source_mask")
+    target_mask = check_mask(target_mask, target.shape[:-1], "target_mask")
+    if init is not None:
+        init = as_float_array(init, "init").astype(source.dtype)
+        check_motion(init, d, "init")
+        init = jnp.broadcast_to(init, (*batch, d + 1, d + 1))
+    if key is not None:
+        key = check_key(key)
+    return _register(method, source, target, source_mask, target_mask, init, key)
+
+
+@eqx.filter_jit
+def _register(
+    method: AbstractRegistrar,
+    source: Array,
+    target: Array,
+    source_mask: Array,
+    target_mask: Array,
+    init: Array | None,
+    key: Array | None,
+) -> RegistrationSolution:
+    batch = source.shape[:-2]
+    if not batch:
+        return _register_pair(
+            method, source, target, source_mask, target_mask, init, key
+        )
+    num = 1
+    for size in batch:
+        num *= size
+    keys = None if key is None else jax.random.split(key, num)
+
+    def flat(x: Array) -> Array:
+        return x.reshape(num, *x.shape[len(batch) :])
+
+    arrays = jax.tree.map(flat, (source, target, source_mask, target_mask, init))
+
+    # One pair after another: a pair fills the machine, and memory stays bounded.
+    def one(args: tuple[tuple[Array, ...], Array | None]) -> RegistrationSolution:
+        return _register_pair(method, *args[0], args[1])
+
+    solution = lax.map(one, (arrays, keys))
+    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solution)
+
+
+def _register_pair(
+    method: AbstractRegistrar,
+    source: Array,
+    target: Array,
+    source_mask: Array,
+    target_mask: Array,
+    init: Array | None,
+    key: Array | None,
+) -> RegistrationSolution:
+    source, source_mask = _finite(source, source_mask)
+    target, target_mask = _finite(target, target_mask)
+    enough = _distinct_enough(source, source_mask) & _distinct_enough(
+        target, target_mask
+    )
+    source_mean = lax.stop_gradient(centroid(source, source_mask))
+    target_mean = lax.stop_gradient(centroid(target, target_mask))
+    radius = lax.stop_gradient(rms_radius(target, target_mask))
+    radius = jnp.where(radius > 0, radius, 1)
+    d = source.shape[1]
+    eye = jnp.eye(d, dtype=source.dtype)
+    if init is not None:
+        R = lie.rotation(init)
+        shift = R @ source_mean + lie.translation(init) - target_mean
+        init = lie.compose(R, shift / radius)
+    solution = method.solve(
+        method.prepare((source - source_mean) / radius, source_mask),
+        method.prepare((target - target_mean) / radius, target_mask),
+        init,
+        key,
+    )
+
+    def back(T: Array) -> Array:
+        """From the centred and scaled frames to those of the input."""
+        R = lie.rotation(T)
+        t = radius * lie.translation(T) + target_mean - R @ source_mean
+        T = lie.compose(R, t)
+        return jnp.where(enough, T, lie.compose(eye, jnp.zeros_like(t)))
+
+    status = jnp.where(enough, solution.status, Status.TOO_FEW_POINTS)
+    return eqx.tree_at(
+        lambda s: (
+            s.T_target_source,
+            s.modes.T_target_source,
+            s.inlier_rmse,
+            s.fitness,
+            s.overlap,
+            s.status,
+        ),
+        solution,
+        (
+            back(solution.T_target_source),
+            jax.vmap(back)(solution.modes.T_target_source),
+            radius * solution.inlier_rmse,
+            jnp.where(enough, solution.fitness, 0),
+            jnp.where(enough, solution.overlap, 0),
+            status.astype(jnp.int32),
+        ),
+    )
+
+
+def _finite(points: Array, mask: Array) -> tuple[Array, Array]:
+    """Masks rows that are not finite; masked rows become a valid row or zero."""
+    mask = mask & jnp.all(jnp.isfinite(points), axis=1)
+    return jnp.where(mask[:, None], points, 0), mask
+
+
+def _distinct_enough(points: Array, mask: Array) -> Array:
+    """Whether at least d + 1 distinct points are valid."""
+    order = jnp.lexsort((*points.T, ~mask))
+    ordered, valid = points[order], mask[order]
+    new = jnp.any(ordered[1:] != ordered[:-1], axis=1) & valid[1:]
+    return jnp.sum(new) + jnp.any(mask) >= points.shape[1] + 1
