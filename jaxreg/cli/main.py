@@ -30,6 +30,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (InputError, MissingExtraError) as err:
         sys.stderr.write(f"jaxreg: {err}\n")
         return 2
+    except OSError as err:
+        where = f"{err.filename}: " if err.filename else ""
+        sys.stderr.write(
+            f"jaxreg: {where}{err.strerror or err}; nothing was written.\n"
+        )
+        return 2
     except KeyboardInterrupt:
         sys.stderr.write("jaxreg: interrupted; no results were written.\n")
         return 130

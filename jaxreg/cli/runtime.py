@@ -48,7 +48,7 @@ class Session:
         self.options = options
         self.command = command
         self.times: dict[str, float] = {}
-        self.console = Console(quiet=options.quiet, highlight=False)
+        self.console = Console(quiet=options.quiet, highlight=False, markup=False)
 
     @contextlib.contextmanager
     def timed(self, part: str, computes: bool = False) -> Iterator[None]:

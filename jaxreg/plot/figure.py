@@ -78,7 +78,7 @@ def _draw_solid(
     model = [x for x, k in zip(after, keep, strict=True) if k]
     model_colors = colors[keep]
     axes_of_model, centre = principal_axes(np.concatenate(model))
-    camera = tilt(20, 25) @ axes_of_model
+    camera = tilt(20.0, 25.0) @ axes_of_model
     # The first panel sees the frames as they came, about their common middle.
     middle = np.median(np.concatenate(before), axis=0)
     _show(axes[0], [(x - middle) @ camera.T for x in before], colors)

@@ -38,7 +38,7 @@ def graph_figure(
     if after[:, 2].any():
         turn, centre = principal_axes(after[placed])
         # Most trajectories are flat: look down on them at an angle.
-        turn = tilt(35, 0) @ turn[[1, 2, 0]]
+        turn = tilt(35.0, 0.0) @ turn[[1, 2, 0]]
     titles = ("before: along a spanning tree", "after")
     for axis, position, title in zip(
         axes, (_positions(T_before), after), titles, strict=True

@@ -58,7 +58,7 @@ def _splat_radius(cell: np.ndarray, group: np.ndarray, num: int) -> int:
     tile = cell // block @ np.array([1, 1 << 20])
     filled = [np.unique(tile[group == g]).size * block**2 for g in range(num)]
     gap = np.sqrt(np.array(filled) / np.maximum(np.bincount(group, minlength=num), 1))
-    return int(np.clip(round(0.8 * float(np.median(gap))), 1, 9))
+    return int(np.clip(round(1.1 * float(np.median(gap))), 1, 9))
 
 
 def _splat(

@@ -1,0 +1,404 @@
+"""Commands with stand-ins for the solvers, so that each test takes milliseconds."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxreg
+from jaxreg import Status
+from jaxreg.cli.main import main
+from jaxreg.io import read_points, read_tum
+
+
+RNG = np.random.default_rng(0)
+CLOUD = RNG.normal(size=(40, 3))
+FILES = ["figure.png", "graph.g2o", "merged.ply", "poses.tum", "result.json"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working folder, and solvers that must not be reached."""
+    monkeypatch.chdir(tmp_path)
+
+    def never(*_: Any, **__: Any) -> None:
+        raise AssertionError("bad input reached the computation")
+
+    monkeypatch.setattr(jaxreg, "reconstruct", never)
+    monkeypatch.setattr(jaxreg, "register", never)
+    return tmp_path
+
+
+def _fake_reconstruct(
+    monkeypatch: pytest.MonkeyPatch, T_true: np.ndarray, placed: list[bool]
+) -> list[Any]:
+    """A solver that knows the poses of the centred scans; returns what it was given."""
+    given: list[Any] = []
+
+    def reconstruct(scans: list[np.ndarray], *, key: Any, progress: Any) -> Any:
+        given.append((scans, key))
+        progress("pairs", 1, 3)
+        progress("pairs", 3, 3)
+        v = len(scans)
+        middles = [np.median(CLOUD, axis=0)] * v
+        T = np.stack([_shift(-middles[0]) @ T_true[i] for i in range(v)])
+        T = np.stack([T[i] @ _shift(_middle_of(T_true[i])) for i in range(v)])
+        edges = np.array([(i, j) for i in range(v) for j in range(i + 1, v)])
+        i, j = edges.T
+        graph = jaxreg.PoseGraph.from_edges(edges, np.linalg.inv(T)[i] @ T[j])
+        both = np.array(placed)[edges].all(axis=1)
+        lost = Status.LOW_OVERLAP
+        return SimpleNamespace(
+            T_world_i=jnp.asarray(T),
+            status=jnp.asarray(0 if all(placed) else Status.DISCONNECTED),
+            scan_status=jnp.asarray([0 if p else lost for p in placed]),
+            placed=jnp.asarray(placed),
+            graph=graph,
+            overlap=jnp.asarray(np.where(both, 0.8, 0.1)),
+            edge_weight=jnp.asarray(both.astype(float)),
+            inlier_rmse=jnp.zeros(len(edges)),
+            num_dropped=jnp.asarray([np.sum(~np.isfinite(s).all(1)) for s in scans]),
+        )
+
+    monkeypatch.setattr(jaxreg, "reconstruct", reconstruct)
+    return given
+
+
+def _shift(t: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = t
+    return T
+
+
+def _middle_of(T_world_scan: np.ndarray) -> np.ndarray:
+    return np.median(_seen_from(T_world_scan), axis=0)
+
+
+def _seen_from(T_world_scan: np.ndarray) -> np.ndarray:
+    T = np.linalg.inv(T_world_scan)
+    return CLOUD @ T[:3, :3].T + T[:3, 3]
+
+
+def _turned(angle: float, offset: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    T = np.eye(4)
+    T[:2, :2], T[:3, 3] = [[c, -s], [s, c]], [offset, 1, 2]
+    return T
+
+
+POSES = np.stack([np.eye(4), _turned(0.4, 3.0), _turned(-1.2, -5.0)])
+
+
+def _save_scans(folder: Path) -> list[str]:
+    for k, T in enumerate(POSES):
+        np.save(folder / f"s{k}.npy", _seen_from(T))
+    return [f"s{k}.npy" for k in range(3)]
+
+
+def _left(folder: Path) -> set[str]:
+    return set(os.listdir(folder))
+
+
+def test_multiview_writes_all_files_and_tables(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)
+    given = _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans, "--seed", "7"]) == 0
+    assert sorted(os.listdir("jaxreg-out")) == FILES
+    for scan in given[0][0]:
+        assert scan.dtype == np.float32
+        np.testing.assert_allclose(np.median(scan, axis=0), 0, atol=1e-6)
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    np.testing.assert_allclose(found["T_world_i"], POSES, atol=2e-6)
+    i, j = 1, 2
+    pair = found["pairs"][2]
+    assert (pair["i"], pair["j"]) == ("s1", "s2")
+    expected = np.linalg.inv(POSES[i]) @ POSES[j]
+    np.testing.assert_allclose(pair["T_i_j"], expected, atol=2e-6)
+    assert found["command"] == "jaxreg multiview s0.npy s1.npy s2.npy --seed 7"
+    assert set(found["times_s"]) == {"read", "compile", "run", "write"}
+    merged = read_points("jaxreg-out/merged.ply").reshape(3, 40, 3)
+    np.testing.assert_allclose(merged[1:], merged[:2], atol=2e-5)
+    text = capsys.readouterr().out
+    assert "CONVERGED: 3 of 3 scans placed, 3 of 3 pairs trusted" in text
+
+
+def test_multiview_far_from_the_origin_keeps_its_digits(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    far = np.array([466123.25, 5427001.5, 100.0])
+    for k, T in enumerate(POSES[:2]):
+        np.savetxt(folder / f"s{k}.xyz", _seen_from(T) + far, fmt="%.9f")
+    _fake_reconstruct(monkeypatch, POSES, [True] * 2)
+    assert main(["multiview", "s0.xyz", "s1.xyz", "--quiet"]) == 0
+    merged = read_points("jaxreg-out/merged.ply").reshape(2, 40, 3)
+    np.testing.assert_allclose(merged[0], CLOUD + far, rtol=0, atol=1e-6)
+    # The turn of 0.4 rad is known to float32, at a lever of some metres.
+    np.testing.assert_allclose(merged[1], merged[0], rtol=0, atol=1e-5)
+    _, poses = read_tum("jaxreg-out/poses.tum")
+    assert poses.shape == (2, 4, 4)
+
+
+def test_truth_adds_errors(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)
+    wrong = POSES.copy()
+    wrong[2] = wrong[2] @ _turned(0.01, 0.0) @ _shift(np.array([0.0, -1.0, -2.0]))
+    _fake_reconstruct(monkeypatch, wrong, [True] * 3)
+    lines = []
+    for name, T in zip(scans, POSES, strict=True):
+        half = 0.5 * np.arctan2(T[1, 0], T[0, 0])
+        t = " ".join(map(str, T[:3, 3]))
+        lines.append(f"bmesh {name} {t} 0 0 {-np.sin(half)} {np.cos(half)}")
+    (folder / "truth.conf").write_text("\n".join(lines).replace(".npy", ".ply"))
+    assert main(["multiview", *scans, "--truth", "truth.conf"]) == 0
+    errors = json.loads(Path("jaxreg-out/result.json").read_text())["errors"]
+    assert errors["names"] == ["s0", "s1", "s2"]
+    np.testing.assert_allclose(errors["e_R"], [0, 0, 0.01], atol=1e-5)
+    assert errors["mean_e_R"] == pytest.approx(0.01 / 3, abs=1e-5)
+    assert "e_R [rad]" in capsys.readouterr().out
+
+
+def test_a_lost_scan_is_reported_and_the_others_are_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)
+    _fake_reconstruct(monkeypatch, POSES, [True, True, False])
+    assert main(["multiview", *scans, "--out", "deep/er"]) == 0
+    text = capsys.readouterr().out
+    assert "LOW_OVERLAP, not placed" in text
+    assert "2 of 3 scans placed" in text
+    found = json.loads(Path("deep/er/result.json").read_text())
+    assert found["T_world_i"][2] is None
+    assert found["scans"][2]["best_pair"]["overlap"] == pytest.approx(0.1)
+    assert len(read_points("deep/er/merged.ply")) == 80
+
+
+def test_scans_without_overlap_are_named_and_nothing_is_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)[:2]
+    _fake_reconstruct(monkeypatch, POSES, [True, False])
+    before = _left(folder)
+    assert main(["multiview", *scans]) == 2
+    message = capsys.readouterr().err
+    assert "s0.npy and s1.npy: no two scans could be joined" in message
+    assert len(message.splitlines()) == 2
+    assert _left(folder) == before
+
+
+def test_dropped_rows_are_counted(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)
+    holed = _seen_from(POSES[1])
+    holed = np.concatenate([holed, [[np.nan, 0, 0], [np.inf, 0, 0]]])
+    np.save(folder / "s1.npy", holed)
+    _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans]) == 0
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    assert [s["num_dropped"] for s in found["scans"]] == [0, 2, 0]
+    assert [s["num_points"] for s in found["scans"]] == [40, 42, 40]
+    assert len(read_points("jaxreg-out/merged.ply")) == 120
+
+
+def test_register_writes_the_motion_between_the_files(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    _save_scans(folder)
+
+    def register(source: np.ndarray, target: np.ndarray, *, key: Any) -> Any:
+        assert np.isfinite(source).all()
+        T = _shift(-np.median(CLOUD, axis=0)) @ POSES[1] @ _shift(_middle_of(POSES[1]))
+        return SimpleNamespace(
+            T_target_source=jnp.asarray(T),
+            status=jnp.asarray(0),
+            fitness=jnp.asarray(0.93),
+            inlier_rmse=jnp.asarray(0.02),
+        )
+
+    monkeypatch.setattr(jaxreg, "register", register)
+    assert main(["register", "s1.npy", "s0.npy"]) == 0
+    assert sorted(os.listdir("jaxreg-out")) == FILES
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    assert found["names"] == ["s0", "s1"]
+    np.testing.assert_allclose(found["T_world_i"][1], POSES[1], atol=2e-6)
+    assert "overlap 0.930" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("status", [Status.LOW_OVERLAP, Status.NON_FINITE])
+def test_register_without_overlap_exits_with_2(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    status: Status,
+):
+    _save_scans(folder)
+
+    def register(source: np.ndarray, target: np.ndarray, *, key: Any) -> Any:
+        return SimpleNamespace(
+            T_target_source=jnp.full((4, 4), jnp.nan),
+            status=jnp.asarray(status),
+            fitness=jnp.asarray(0.0),
+            inlier_rmse=jnp.asarray(jnp.nan),
+        )
+
+    monkeypatch.setattr(jaxreg, "register", register)
+    before = _left(folder)
+    assert main(["register", "s1.npy", "s0.npy"]) == 2
+    message = capsys.readouterr().err
+    assert f"s1.npy onto s0.npy: {status.name}" in message
+    assert len(message.splitlines()) == 2
+    assert _left(folder) == before
+
+
+def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
+    """Command lines that must fail, and what their message must name."""
+    _save_scans(folder)
+    (folder / "empty.xyz").write_text("")
+    (folder / "broken.ply").write_text("ply\nnothing more\n")
+    (folder / "occupied").write_text("a file")
+    np.save(folder / "few.npy", np.repeat(CLOUD[:3], 9, axis=0))
+    np.save(folder / "nan.npy", np.where(np.arange(40)[:, None] < 3, CLOUD, np.nan))
+    np.save(folder / "flat.npy", CLOUD[:, :2])
+    np.savez(folder / "one.npz", alone=CLOUD)
+    np.savez(folder / "three.npz", a=CLOUD, b=CLOUD, c=CLOUD)
+    (folder / "hollow").mkdir()
+    (folder / "bad.g2o").write_text("EDGE_SE3:QUAT 0 1 1 2 3\n")
+    (folder / "other.conf").write_text("bmesh chin.ply 0 0 0 0 0 0 1\n")
+    m, r, a = "multiview", "register", "average"
+    pair = ["s0.npy", "s1.npy"]
+    return {
+        "missing": ([m, "s0.npy", "none.ply"], "none.ply"),
+        "empty": ([m, "s0.npy", "empty.xyz"], "empty.xyz"),
+        "unreadable": ([m, "s0.npy", "broken.ply"], "broken.ply"),
+        "too few": ([m, "s0.npy", "few.npy"], "few.npy: holds 3 distinct"),
+        "all but three NaN": ([m, "s0.npy", "nan.npy"], "nan.npy: holds 3 distinct"),
+        "mixed": ([m, "s0.npy", "flat.npy"], "flat.npy: is 2D, but s0.npy is 3D"),
+        "one file": ([m, "s0.npy"], "s0.npy: this is one scan alone"),
+        "one in archive": ([m, "one.npz"], "one.npz: this is one scan alone"),
+        "no scan": ([m], "No scans given"),
+        "empty folder": ([m, "hollow"], "hollow: the folder holds no point files"),
+        "out is a file": ([m, *pair, "--out", "occupied"], "occupied"),
+        "out below a file": ([r, *pair, "--out", "occupied/x"], "occupied"),
+        "demo out": (["demo", "--out", "occupied"], "occupied"),
+        "bad seed": ([m, *pair, "--seed", "-1"], "--seed -1"),
+        "truth missing": ([m, *pair, "--truth", "none.conf"], "none.conf"),
+        "truth of others": ([m, *pair, "--truth", "other.conf"], "other.conf"),
+        "register missing": ([r, "s0.npy", "none.ply"], "none.ply"),
+        "register many": ([r, "three.npz", "s0.npy"], "three.npz"),
+        "graph missing": ([a, "none.g2o"], "none.g2o"),
+        "graph cut off": ([a, "bad.g2o"], "bad.g2o, line 1"),
+    }
+
+
+@pytest.mark.parametrize("kind", range(20))
+def test_bad_input_is_named_in_two_lines_with_exit_code_2(
+    folder: Path, capsys: pytest.CaptureFixture[str], kind: int
+):
+    arguments, named = list(_bad_inputs(folder).values())[kind]
+    before = _left(folder)
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert named in captured.err
+    assert len(captured.err.splitlines()) <= 2
+    assert captured.out == ""
+    assert _left(folder) == before
+
+
+def test_a_failure_while_writing_leaves_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    scans = _save_scans(folder)
+    _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("jaxreg.io.result.write_g2o", full)
+    before = _left(folder)
+    assert main(["multiview", *scans]) == 2
+    assert _left(folder) == before
+
+
+def test_interruption_is_said_in_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jaxreg, "reconstruct", stopped)
+    assert main(["multiview", *scans]) == 130
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_missing_extra_is_said_in_two_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(
+        "jaxreg.cli.main.find_spec", lambda name: None if name == "rich" else name
+    )
+    assert main(["demo"]) == 2
+    message = capsys.readouterr().err
+    assert "rich" in message
+    assert "pip install 'jaxreg[app]'" in message
+
+
+def test_version(capsys: pytest.CaptureFixture[str]):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("jaxreg ")
+
+
+def test_quiet_prints_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)
+    _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans, "--quiet"]) == 0
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "")
+
+
+def test_python_m_jaxreg_is_the_command(tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxreg", "multiview", str(tmp_path / "none.ply")],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[2],
+        timeout=120,
+    )
+    assert done.returncode == 2
+    assert "none.ply: no such file" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+GRAPH = """\
+VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 1 0 0
+VERTEX_SE2 2 1 1 0
+EDGE_SE2 0 1 1 0 1.5 1 0 0 1 0 1
+EDGE_SE2 1 2 1 0 1.5 1 0 0 1 0 1
+EDGE_SE2 0 2 1.1 1 3.0 1 0 0 1 0 1
+"""
+
+
+def test_average_lowers_the_objective(folder: Path, capsys: pytest.CaptureFixture[str]):
+    (folder / "g.g2o").write_text(GRAPH)
+    assert main(["average", "g.g2o", "--method", "plain"]) == 0
+    assert sorted(os.listdir("jaxreg-out")) == [f for f in FILES if f != "merged.ply"]
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    assert 0 < found["objective_after"] < found["objective_before"]
+    assert found["names"] == [0, 1, 2]
+    assert np.shape(found["T_world_i"]) == (3, 3, 3)
+    assert "objective" in capsys.readouterr().out
