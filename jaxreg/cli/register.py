@@ -74,7 +74,7 @@ def _register(scans: Scans, key: jax.Array) -> Result:
         num_dropped=rows - [len(target), len(source)],
         edges=np.array([[0, 1]]),
         T_i_j=T_target_source,
-        overlap=np.array([float(sol.fitness)]),
+        overlap=np.array([float(sol.overlap)]),
         weight=np.array([float(found)]),
         inlier_rmse=np.array([float(sol.inlier_rmse)]),
     )

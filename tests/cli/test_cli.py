@@ -222,7 +222,8 @@ def test_register_writes_the_motion_between_the_files(
         return SimpleNamespace(
             T_target_source=jnp.asarray(T),
             status=jnp.asarray(0),
-            fitness=jnp.asarray(0.93),
+            fitness=jnp.asarray(0.95),
+            overlap=jnp.asarray(0.93),
             inlier_rmse=jnp.asarray(0.02),
         )
 
@@ -249,6 +250,7 @@ def test_register_without_overlap_exits_with_2(
             T_target_source=jnp.full((4, 4), jnp.nan),
             status=jnp.asarray(status),
             fitness=jnp.asarray(0.0),
+            overlap=jnp.asarray(0.0),
             inlier_rmse=jnp.asarray(jnp.nan),
         )
 
