@@ -96,7 +96,7 @@ class ParticleFilter(AbstractRegistrar):
     width_end: Float[Array, ""] = traced(0.06)
     translation_spread: Float[Array, ""] = traced(0.5)
     init_spread: Float[Array, ""] = traced(0.3)
-    min_overlap: Float[Array, ""] = traced(0.15)
+    min_overlap: Float[Array, ""] = traced(0.12)
     residual: PointToPlane = eqx.field(default_factory=lambda: PointToPlane(0.2))
     kernel: AbstractKernel = eqx.field(default_factory=GemanMcClure)
 

@@ -1,0 +1,100 @@
+"""Scans made ready for pairs: cleaned, centred, scaled, thinned and indexed, once each."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.typing import Motions, Scalar
+from jaxreg.cloud import PointCloud, centroid, median_spacing, rms_radius
+from jaxreg.geometry import lie
+from jaxreg.neighbours import VoxelTable
+from jaxreg.particle import ParticleFilter
+
+
+class PreparedScans(eqx.Module):
+    """Scans with a leading axis, each in its own centred frame, in one common scale.
+
+    Attributes:
+        clouds: `(v, n, d)` thinned points with normals; the unit is `radius`.
+        tables: their voxel tables.
+        mean: `(v, d)` centroid of each scan in its input frame.
+        radius: the median root mean square radius of the scans, in the input's unit.
+        spacing: `(v,)` distance between thinned points, in units of `radius`.
+        enough: `(v,)` False for scans of fewer than d + 1 valid points.
+        num_dropped: `(v,)` rows of the input that were not finite.
+    """
+
+    clouds: PointCloud
+    tables: VoxelTable
+    mean: Float[Array, "v d"]
+    radius: Scalar
+    spacing: Float[Array, " v"]
+    enough: Bool[Array, " v"]
+    num_dropped: Int[Array, " v"]
+
+    @property
+    def num_scans(self) -> int:
+        """v."""
+        return self.mean.shape[0]
+
+    def cloud(self, i: Int[Array, ""]) -> PointCloud:
+        """One scan's thinned points."""
+        return jax.tree.map(lambda x: x[i], self.clouds)
+
+    def table(self, i: Int[Array, ""]) -> VoxelTable:
+        """One scan's index."""
+        return jax.tree.map(lambda x: x[i], self.tables)
+
+    def to_input_frames(
+        self, T_i_j: Motions, i: Int[Array, "*b"], j: Int[Array, "*b"]
+    ) -> Motions:
+        """Motions between centred, scaled frames as motions between input frames."""
+        R = lie.rotation(T_i_j)
+        t = self.radius * lie.translation(T_i_j) + self.mean[i]
+        return lie.compose(R, t - jnp.einsum("...ij,...j->...i", R, self.mean[j]))
+
+
+def clean(
+    points: Float[Array, "v n d"], mask: Bool[Array, "v n"]
+) -> tuple[Float[Array, "v n d"], Bool[Array, "v n"], Int[Array, " v"]]:
+    """Masks and counts rows that are not finite."""
+    finite = jnp.all(jnp.isfinite(points), axis=-1)
+    dropped = jnp.sum(mask & ~finite, axis=-1).astype(jnp.int32)
+    mask = mask & finite
+    return jnp.where(mask[..., None], points, 0), mask, dropped
+
+
+def common_radius(points: Float[Array, "v n d"], mask: Bool[Array, "v n"]) -> Scalar:
+    """The median radius of the scans that have points; 1 if none has an extent."""
+    radius = jax.vmap(rms_radius)(points, mask)
+    radius = jnp.nanmedian(jnp.where(radius > 0, radius, jnp.nan))
+    return jnp.where(jnp.isfinite(radius), radius, 1)
+
+
+def prepare_scan(
+    method: ParticleFilter,
+    points: Float[Array, "n d"],
+    mask: Bool[Array, " n"],
+    radius: Scalar,
+) -> tuple[PointCloud, VoxelTable, Float[Array, " d"], Scalar]:
+    """One scan: cloud, table, centroid and spacing."""
+    mean = centroid(points, mask)
+    cloud = method.prepare((points - mean) / radius, mask)
+    table = VoxelTable.build(cloud.points, cloud.mask)
+    return cloud, table, mean, median_spacing(cloud.points, cloud.mask)
+
+
+@eqx.filter_jit
+def prepare_scans(
+    method: ParticleFilter, points: Float[Array, "v n d"], mask: Bool[Array, "v n"]
+) -> PreparedScans:
+    """Prepares all scans, one after another."""
+    points, mask, dropped = clean(points, mask)
+    radius = common_radius(points, mask)
+    clouds, tables, mean, spacing = lax.map(
+        lambda scan: prepare_scan(method, *scan, radius), (points, mask)
+    )
+    enough = (jnp.sum(clouds.mask, axis=1) > points.shape[-1]) & (spacing > 0)
+    return PreparedScans(clouds, tables, mean, radius, spacing, enough, dropped)
