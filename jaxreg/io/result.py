@@ -7,6 +7,7 @@ in the frames and unit of the files that were read.
 import json
 import math
 import platform
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -26,6 +27,7 @@ from jaxreg.io.ply import write_ply
 from jaxreg.io.tum import write_tum
 
 
+_ROW = re.compile(r"\[[-+.,\d\seE]*\]")
 MAX_MERGED_POINTS = 2_000_000
 
 
@@ -109,9 +111,11 @@ def result_document(
 
 def write_json(path: str | Path, document: dict[str, Any]) -> None:
     """Writes a document as JSON; numbers that are not finite become null."""
+    text = json.dumps(_finite(document), indent=1, allow_nan=False)
+    # Rows of matrices on one line, so that a person can read them.
+    text = _ROW.sub(lambda row: " ".join(row[0].split()), text)
     with atomic_write(path) as file:
-        json.dump(_finite(document), file, indent=1, allow_nan=False)
-        file.write("\n")
+        file.write(text + "\n")
 
 
 def write_result(

@@ -86,8 +86,10 @@ def _draw_solid(
     _show(axes[1], [(x - centre) @ camera.T for x in model], model_colors)
     axes[1].set_title("after: one frame")
     section, width = _section([(x - centre) @ axes_of_model.T for x in model])
-    for points, color in zip(section, model_colors, strict=True):
-        axes[2].plot(*points.T, ".", color=color, markersize=3, markeredgewidth=0)
+    # In random order, so that no scan hides the others.
+    order = np.random.default_rng(0).permutation(sum(len(x) for x in section))
+    tint = np.repeat(model_colors, [len(x) for x in section], axis=0)[order]
+    axes[2].scatter(*np.concatenate(section)[order].T, s=7, c=tint, linewidths=0)
     axes[2].set_title(f"cross-section, {width:.2g} thick")
 
 
@@ -100,7 +102,9 @@ def _draw_flat(
 ) -> None:
     size = float(np.clip(400 / np.sqrt(max(len(x) for x in before)), 2, 7))
     for k, color in enumerate(colors):
-        style = {"color": color, "markersize": size, "markeredgewidth": 0, "alpha": 0.7}
+        # Later ones smaller, so that points which coincide are both seen.
+        s = size * (1.3 - 0.7 * k / max(len(colors) - 1, 1))
+        style = {"color": color, "markersize": s, "markeredgewidth": 0}
         axes[0].plot(*before[k].T, "o", **style)
         if keep[k]:
             axes[1].plot(*after[k].T, "o", **style)
