@@ -112,7 +112,9 @@ def _voxel_size(points: Array, mask: Array, low: Array, side: Array, cap: int) -
     return lax.fori_loop(0, 10, halve, (side / (_MAX_CELLS - 1), side))[1]
 
 
-def thin(points: Points, mask: Mask, capacity: int, *, neighbours: int = 10) -> PointCloud:
+def thin(
+    points: Points, mask: Mask, capacity: int, *, neighbours: int = 10
+) -> PointCloud:
     """At most `capacity` points, evenly spread, with normals from all the points.
 
     Points that share a voxel are replaced by their mean; the voxel is chosen as small

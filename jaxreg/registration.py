@@ -1,5 +1,7 @@
 """`register`: the pose of one point set in the frame of another."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -121,8 +123,11 @@ def _register(
     arrays = jax.tree.map(flat, (source, target, source_mask, target_mask, init))
 
     # One pair after another: a pair fills the machine, and memory stays bounded.
-    def one(args: tuple[tuple[Array, ...], Array | None]) -> RegistrationSolution:
-        return _register_pair(method, *args[0], args[1])
+    def one(args: tuple[Any, Array | None]) -> RegistrationSolution:
+        (source, target, source_mask, target_mask, init), key = args
+        return _register_pair(
+            method, source, target, source_mask, target_mask, init, key
+        )
 
     solution = lax.map(one, (arrays, keys))
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solution)

@@ -1,11 +1,19 @@
 """Checks of arguments while tracing: they raise and name what was found and wanted."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from jaxreg._core.typing import Key
+
+
+def is_concrete(x: Any) -> bool:
+    """True where the values can be read, False while tracing."""
+    return not isinstance(x, Tracer)
 
 
 def as_float_array(x: object, name: str) -> Array:

@@ -57,13 +57,14 @@ def reconstruct_scans(scans: Scans, key: Any, progress: Progress) -> Result:
 
     centred, middles = scans.centred()
     sol = jaxreg.reconstruct(centred, key=key, progress=progress)
-    keep = np.asarray(sol.graph.mask)
+    placed, keep = np.asarray(sol.placed), np.asarray(sol.graph.mask)
+    world = middles[np.argmax(placed)]  # the frame of the first placed scan
     edges = np.asarray(sol.graph.edges)[keep]
     i, j = edges.T
     return Result(
         names=scans.names,
-        T_world_i=outputs.uncentre(np.asarray(sol.T_world_i), middles[0], middles),
-        placed=np.asarray(sol.placed),
+        T_world_i=outputs.uncentre(np.asarray(sol.T_world_i), world, middles),
+        placed=placed,
         status=Status(int(sol.status)),
         scan_status=np.asarray(sol.scan_status),
         num_points=np.array([len(x) for x in scans.points]),

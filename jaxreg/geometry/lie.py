@@ -145,7 +145,9 @@ def random_rotations(
 def rotation_angle(R: Float[Array, "*b d d"]) -> Float[Array, "*b"]:
     """The angle of rotation in [0, pi], accurate also near 0 and pi (no arccos)."""
     if R.shape[-1] == 2:
-        return jnp.abs(jnp.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1]))
+        return jnp.abs(
+            jnp.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1])
+        )
     vee = jnp.stack(
         [
             R[..., 2, 1] - R[..., 1, 2],

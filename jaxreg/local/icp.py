@@ -5,7 +5,6 @@ index x residual x kernel x step: Besl and McKay 1992 is `PointToPoint` with `L2
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -93,8 +92,8 @@ class ICP(AbstractRegistrar):
     index: type[AbstractIndex] = eqx.field(default=BruteForce, static=True)
     max_steps: int = eqx.field(default=60, static=True)
     max_points: int = eqx.field(default=4096, static=True)
-    width_end: Float[Array, ""] = traced(1.5)
-    tolerance: Float[Array, ""] = traced(1e-5)
+    width_end: Array | float = traced(1.5)
+    tolerance: Array | float = traced(1e-5)
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
         """Thinned to `max_points`, with normals."""

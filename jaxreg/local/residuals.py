@@ -69,12 +69,12 @@ class PointToPlane(AbstractResidual):
         point_share: weight of the point-to-point residual beside it.
     """
 
-    point_share: Float[Array, ""] = traced(0.05)
+    point_share: Array | float = traced(0.05)
 
     def normal_equations(
         self, match: Match, weight: Float[Array, " n"]
     ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
-        """The Gram matrix of the rows (n, x cross n, n . r), plus the share of points."""
+        """The Gram matrix of rows (n, x cross n, n . r), plus the share of points."""
         x, n = match.rotated, match.normal
         if x.shape[0] == 2:
             turn = [x[0] * n[1] - x[1] * n[0]]
@@ -87,7 +87,7 @@ class PointToPlane(AbstractResidual):
         rows = jnp.stack([*n, *turn, match.plane_residual])
         gram = weighted_gram(rows, weight)
         H, b = PointToPoint().normal_equations(match, weight)
-        share = self.point_share.astype(H.dtype)
+        share = jnp.asarray(self.point_share, H.dtype)
         return gram[:-1, :-1] + share * H, gram[:-1, -1] + share * b
 
 
@@ -114,12 +114,12 @@ class Moments(eqx.Module):
 def weighted_gram(
     rows: Float[Array, "r n"], weight: Float[Array, " n"]
 ) -> Float[Array, "r r"]:
-    """rows diag(weight) rows^T in full precision on every device."""
+    """Rows diag(weight) rows^T in full precision on every device."""
     return jnp.matmul(rows * weight, rows.T, precision=lax.Precision.HIGHEST)
 
 
 def skew(x: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The matrix of the cross product: skew(x) y = x cross y."""
+    """The matrix that multiplies y to give the cross product of x and y."""
     zero = jnp.zeros_like(x[0])
     return jnp.stack(
         [

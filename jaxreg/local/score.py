@@ -25,7 +25,9 @@ class Score(eqx.Module):
     inlier_rmse: Float[Array, ""]
 
 
-def score(problem: Problem, T_target_source: Motion, spacing: Float[Array, ""]) -> Score:
+def score(
+    problem: Problem, T_target_source: Motion, spacing: Float[Array, ""]
+) -> Score:
     """The share of the source that lies on the target, and its plane residual.
 
     Args:

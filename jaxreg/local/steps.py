@@ -65,7 +65,7 @@ class GaussNewton(AbstractStep):
             finite where the data leave a direction free.
     """
 
-    damping: Float[Array, ""] = traced(1e-5)
+    damping: Array | float = traced(1e-5)
 
     def __call__(
         self,
@@ -78,7 +78,7 @@ class GaussNewton(AbstractStep):
         H, b = residual.normal_equations(match, weight)
         k = b.shape[0]
         # The floor keeps H positive definite where nothing matches.
-        level = self.damping.astype(b.dtype) * jnp.trace(H) / k
+        level = jnp.asarray(self.damping, b.dtype) * jnp.trace(H) / k
         level = level + jnp.finfo(b.dtype).tiny ** 0.5
         factor = cho_factor(H + level * jnp.eye(k, dtype=b.dtype))
         return turn_and_shift(T_target_source, cho_solve(factor, b))

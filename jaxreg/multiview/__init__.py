@@ -1,6 +1,6 @@
 """Many scans into one frame."""
 
-from jaxreg.multiview.reconstruct import reconstruct as reconstruct
 from jaxreg.multiview.reconstruct import (
     ReconstructionSolution as ReconstructionSolution,
 )
+from jaxreg.multiview.reconstruct import reconstruct as reconstruct

@@ -1,4 +1,4 @@
-"""From relative motions to poses: choose trustworthy pairs, average, see who is placed."""
+"""From relative motions to poses: which pairs to trust, and which scans they place."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -44,12 +44,12 @@ def place(
     root = jnp.argmax(size).astype(jnp.int32)
     # Averaging fixes frame 0: swap the root's number with 0.
     swap = jnp.arange(num_scans, dtype=jnp.int32).at[root].set(0).at[0].set(root)
-    graph = PoseGraph(
-        swap[pairs], motions.T_i_j, trusted, trusted > 0, None, num_scans
-    )
+    graph = PoseGraph(swap[pairs], motions.T_i_j, trusted, trusted > 0, None, num_scans)
     solution = average(graph, averaging)
     edge_weight = solution.edge_weight * (trusted > 0)
-    label = components(pairs, jnp.where(edge_weight > _MIN_TRUST, trusted, 0), num_scans)
+    label = components(
+        pairs, jnp.where(edge_weight > _MIN_TRUST, trusted, 0), num_scans
+    )
     placed = (label == label[root]) & solution.placed[swap]
     return Placement(
         solution.T_world_i[swap], placed, edge_weight, solution.status, root

@@ -7,7 +7,7 @@ with arrays, a thin loop around them divides the pairs into batches, runs two at
 time, and reports progress.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
@@ -16,7 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.checks import as_float_array, check_key, check_mask, check_points
+from jaxreg._core.checks import (
+    as_float_array,
+    check_key,
+    check_mask,
+    check_points,
+    is_concrete,
+)
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Progress, StatusArray
 from jaxreg.averaging import AbstractAverager
@@ -66,7 +72,7 @@ class ReconstructionSolution(eqx.Module):
 
     def __repr__(self) -> str:
         """One line: status, scans placed, pairs trusted."""
-        if isinstance(self.status, jax.core.Tracer) or self.status.ndim:
+        if not is_concrete(self.status) or self.status.ndim:
             return f"ReconstructionSolution(T_world_i {self.T_world_i.shape})"
         return (
             f"ReconstructionSolution({Status(int(self.status)).name}, "
@@ -119,7 +125,7 @@ def reconstruct(
         )
     key = check_key(key)
     pairs = all_pairs(points.shape[0])
-    if isinstance(points, jax.core.Tracer) or isinstance(key, jax.core.Tracer):
+    if not (is_concrete(points) and is_concrete(key)):
         prepared = prepare_scans(method, points, row_mask)
         motions = relative_motions(method, prepared, pairs, key)
         return _finish(method, averaging, prepared, pairs, motions)
@@ -188,19 +194,24 @@ def _motions_in_batches(
 
     starts = range(0, total, _PAIRS_PER_BATCH)
     report("registering pairs", 0, total)
+    batches = [run(0)]  # compiles; the threads then share the program
+    report("registering pairs", min(_PAIRS_PER_BATCH, total), total)
     with ThreadPoolExecutor(_THREADS) as pool:
-        batches = []
-        for batch in _in_order(pool, run, starts):
+        for batch in _in_order(pool, run, starts[1:]):
             batches.append(batch)
             done = min(len(batches) * _PAIRS_PER_BATCH, total)
             report("registering pairs", done, total)
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:total], *batches)
 
 
-def _in_order(pool: ThreadPoolExecutor, run: object, starts: range) -> Iterator:
+def _in_order(
+    pool: ThreadPoolExecutor,
+    run: Callable[[int], RelativeMotions],
+    starts: range,
+) -> Iterator[RelativeMotions]:
     """Results in order; on an interruption, batches not begun are dropped."""
     try:
-        yield from pool.map(run, starts)  # pyright: ignore[reportArgumentType]
+        yield from pool.map(run, starts)
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         raise
@@ -215,7 +226,7 @@ def _finish(
     motions: RelativeMotions,
 ) -> ReconstructionSolution:
     """Averages, refines, and returns to the frames and unit of the input."""
-    min_overlap = method.min_overlap.astype(scans.radius.dtype)
+    min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
     placement = place(motions, pairs, scans.num_scans, averaging, min_overlap)
     T_centred = refine_jointly(
         scans, placement.T_world_i, placement.placed, min_overlap / 2
@@ -235,9 +246,9 @@ def _finish(
     scan_status = jnp.where(scans.enough, scan_status, Status.TOO_FEW_POINTS)
     return ReconstructionSolution(
         T_world_i=_in_first_frame(scans, T_centred, placement),
-        status=jnp.where(
-            jnp.all(placed), Status.CONVERGED, Status.DISCONNECTED
-        ).astype(jnp.int32),
+        status=jnp.where(jnp.all(placed), Status.CONVERGED, Status.DISCONNECTED).astype(
+            jnp.int32
+        ),
         scan_status=scan_status.astype(jnp.int32),
         placed=placed,
         graph=graph,

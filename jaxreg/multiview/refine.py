@@ -9,11 +9,11 @@ paper's chain, pairs then averaging, closed into a loop.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Scalar
-from jaxreg.cloud import PointCloud
 from jaxreg.geometry import lie
 from jaxreg.local import Problem, match, score, turn_and_shift
 from jaxreg.local.residuals import weighted_gram
@@ -89,10 +89,8 @@ def refine_jointly(
 
 
 def _ordered_pairs(num_scans: int) -> Int[Array, "e 2"]:
-    i, j = jnp.meshgrid(jnp.arange(num_scans), jnp.arange(num_scans), indexing="ij")
-    both = jnp.stack([i.ravel(), j.ravel()], axis=1)
-    off_diagonal = [a * num_scans + b for a in range(num_scans) for b in range(num_scans) if a != b]
-    return both[jnp.asarray(off_diagonal, jnp.int32)].astype(jnp.int32)
+    i, j = np.nonzero(~np.eye(num_scans, dtype=bool))
+    return jnp.asarray(np.stack([i, j], axis=1), jnp.int32)
 
 
 def _pair_equations(
@@ -124,7 +122,7 @@ def _pair_equations(
 
 
 def _turn(x: Float[Array, "d n"], n: Float[Array, "d n"]) -> Float[Array, "r n"]:
-    """x cross n, the derivative of n . (w cross x) in w."""
+    """X cross n, the derivative of n . (w cross x) in w."""
     if x.shape[0] == 2:
         return (x[0] * n[1] - x[1] * n[0])[None]
     return jnp.cross(x, n, axis=0)

@@ -1,4 +1,4 @@
-"""Scans made ready for pairs: cleaned, centred, scaled, thinned and indexed, once each."""
+"""Scans made ready for pairs, once each: cleaned, centred, scaled, thinned, indexed."""
 
 import equinox as eqx
 import jax
@@ -36,7 +36,7 @@ class PreparedScans(eqx.Module):
 
     @property
     def num_scans(self) -> int:
-        """v."""
+        """V."""
         return self.mean.shape[0]
 
     def cloud(self, i: Int[Array, ""]) -> PointCloud:
@@ -94,7 +94,7 @@ def prepare_scans(
     points, mask, dropped = clean(points, mask)
     radius = common_radius(points, mask)
     clouds, tables, mean, spacing = lax.map(
-        lambda scan: prepare_scan(method, *scan, radius), (points, mask)
+        lambda scan: prepare_scan(method, scan[0], scan[1], radius), (points, mask)
     )
     enough = (jnp.sum(clouds.mask, axis=1) > points.shape[-1]) & (spacing > 0)
     return PreparedScans(clouds, tables, mean, radius, spacing, enough, dropped)

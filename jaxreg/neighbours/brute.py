@@ -57,7 +57,7 @@ class BruteForce(AbstractIndex):
 
 
 def _target_tiles(points: Array, mask: Array) -> tuple[Array, Array, Array]:
-    """Coordinates `(tiles, d, width)`, penalty `(tiles, width)`, first row `(tiles,)`."""
+    """Coordinates `(t, d, width)`, penalty `(t, width)`, first row `(t,)` of tiles."""
     m = points.shape[0]
     width = min(_TARGET_TILE, m)
     pad = -m % width
@@ -76,7 +76,10 @@ def _closest_over_tiles(
     def step(best: tuple[Array, Array], tile: tuple[Array, Array, Array]):
         row, sq = _closest_in_tile(queries, tile[0], tile[1])
         better = sq < best[1]
-        best = (jnp.where(better, row + tile[2], best[0]), jnp.where(better, sq, best[1]))
+        best = (
+            jnp.where(better, row + tile[2], best[0]),
+            jnp.where(better, sq, best[1]),
+        )
         return best, None
 
     start = (

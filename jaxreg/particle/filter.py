@@ -90,13 +90,13 @@ class ParticleFilter(AbstractRegistrar):
     num_modes: int = eqx.field(default=4, static=True)
     max_points: int = eqx.field(default=4096, static=True)
     batch_size: int = eqx.field(default=32, static=True)
-    diffusion: Float[Array, ""] = traced(1.0)
-    sample_share: Float[Array, ""] = traced(0.5)
-    width_start: Float[Array, ""] = traced(0.3)
-    width_end: Float[Array, ""] = traced(0.06)
-    translation_spread: Float[Array, ""] = traced(0.5)
-    init_spread: Float[Array, ""] = traced(0.3)
-    min_overlap: Float[Array, ""] = traced(0.12)
+    diffusion: Array | float = traced(1.0)
+    sample_share: Array | float = traced(0.5)
+    width_start: Array | float = traced(0.3)
+    width_end: Array | float = traced(0.06)
+    translation_spread: Array | float = traced(0.5)
+    init_spread: Array | float = traced(0.3)
+    min_overlap: Array | float = traced(0.12)
     residual: PointToPlane = eqx.field(default_factory=lambda: PointToPlane(0.2))
     kernel: AbstractKernel = eqx.field(default_factory=GemanMcClure)
 
@@ -196,7 +196,9 @@ class ParticleFilter(AbstractRegistrar):
         key_prior, key_first, key_loop = jax.random.split(key, 3)
         if init is None:
             d = problem.source.shape[0]
-            T = prior.uniform(key_prior, self.num_prior, d, self.translation_spread)
+            T = prior.uniform(
+                key_prior, self.num_prior, d, self.translation_spread, dtype
+            )
         else:
             spread = self.init_spread
             T = prior.gaussian(key_prior, self.num_prior, init, spread, spread)
@@ -265,9 +267,9 @@ class ParticleFilter(AbstractRegistrar):
         d = T.shape[-1] - 1
         few = jnp.minimum(jnp.sum(source.mask), jnp.sum(target.mask)) < d + 1
         status = jnp.where(few, Status.TOO_FEW_POINTS, status)
-        return jnp.where(
-            jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE
-        ).astype(jnp.int32)
+        return jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE).astype(
+            jnp.int32
+        )
 
 
 def _some_points(key: Key, problem: Problem, num: int) -> Problem:

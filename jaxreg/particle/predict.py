@@ -3,13 +3,13 @@
 import jax
 from jaxtyping import Array, Float
 
-from jaxreg._core.typing import Key, Scalar
+from jaxreg._core.typing import Key
 from jaxreg.local import turn_and_shift
 from jaxreg.particle.state import Particles
 
 
 def diffuse(
-    key: Key, particles: Particles, scale: Scalar
+    key: Key, particles: Particles, scale: Array | float
 ) -> Float[Array, "p D D"]:
     """Predicted poses: each particle moves along its own motion error e.
 

@@ -1,5 +1,7 @@
 """Where the particles start: pi_0 (PF paper, section 4.2)."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -10,12 +12,12 @@ from jaxreg.local import turn_and_shift
 
 
 def uniform(
-    key: Key, num: int, d: int, spread: Float[Array, ""]
+    key: Key, num: int, d: int, spread: Array | float, dtype: Any
 ) -> Float[Array, "p D D"]:
     """Rotations uniform over SO(d), translations normal with deviation `spread`."""
     key_R, key_t = jax.random.split(key)
-    R = lie.random_rotations(key_R, num, d, spread.dtype)
-    t = spread * jax.random.normal(key_t, (num, d), spread.dtype)
+    R = lie.random_rotations(key_R, num, d, dtype)
+    t = spread * jax.random.normal(key_t, (num, d), dtype)
     return lie.compose(R, t)
 
 
@@ -23,8 +25,8 @@ def gaussian(
     key: Key,
     num: int,
     init: Motion,
-    translation_spread: Float[Array, ""],
-    rotation_spread: Float[Array, ""],
+    translation_spread: Array | float,
+    rotation_spread: Array | float,
 ) -> Float[Array, "p D D"]:
     """Poses around `init`, normal in each tangent coordinate; the first is `init`."""
     d = init.shape[-1] - 1

@@ -14,7 +14,7 @@ def effective_sample_size(weight: Float[Array, " p"]) -> Float[Array, ""]:
 
 
 def tempered_weights(
-    energy: Float[Array, " p"], target_size: Float[Array, ""]
+    energy: Float[Array, " p"], target_size: Array | float
 ) -> Float[Array, " p"]:
     """Normalised exp(-energy / temperature) with a given effective sample size.
 
@@ -43,9 +43,7 @@ def tempered_weights(
     return weights(lax.fori_loop(0, 24, halve, (span * 1e-4, span * 1e3))[1])
 
 
-def systematic(
-    key: Key, weight: Float[Array, " p"], num: int
-) -> Int[Array, " q"]:
+def systematic(key: Key, weight: Float[Array, " p"], num: int) -> Int[Array, " q"]:
     """Ancestors drawn by systematic resampling: one uniform number for all.
 
     The expected number of copies of i is num * weight_i, the actual one is that

@@ -89,7 +89,7 @@ def _draw_solid(
     # In random order, so that no scan hides the others.
     order = np.random.default_rng(0).permutation(sum(len(x) for x in section))
     tint = np.repeat(model_colors, [len(x) for x in section], axis=0)[order]
-    axes[2].scatter(*np.concatenate(section)[order].T, s=7, c=tint, linewidths=0)
+    axes[2].scatter(*np.concatenate(section)[order].T, s=4, c=tint, linewidths=0)
     axes[2].set_title(f"cross-section, {width:.2g} thick")
 
 
