@@ -45,8 +45,8 @@ def rms_radius(points: Points, mask: Mask) -> Float[Array, ""]:
 
 
 def nearest_rows(
-    queries: Points, points: Points, mask: Mask, k: int
-) -> tuple[Int[Array, "n k"], Float[Array, "n k"]]:
+    queries: Float[Array, "q d"], points: Points, mask: Mask, k: int
+) -> tuple[Int[Array, "q k"], Float[Array, "q k"]]:
     """Rows and squared distances of the k nearest valid points, by brute force.
 
     Tiled over the queries. Where fewer than k points are valid, the squared distance
@@ -68,9 +68,11 @@ def nearest_rows(
 
 
 def median_spacing(points: Points, mask: Mask) -> Float[Array, ""]:
-    """The median distance from a valid point to its nearest other valid point.
+    """The spacing of the samples: on a regular grid its step.
 
-    Measured from 256 rows spread over the array. Duplicates are skipped.
+    The median distance from a valid point to its second other point on a curve, its
+    fourth on a surface: the nearest one tells little of random samples. Measured from
+    256 rows spread over the array; duplicates of a point are skipped.
     """
     at = jnp.linspace(0, points.shape[0] - 1, min(256, points.shape[0])).astype(
         jnp.int32
@@ -78,10 +80,11 @@ def median_spacing(points: Points, mask: Mask) -> Float[Array, ""]:
     order = jnp.argsort(~mask, stable=True)  # valid rows first
     num = jnp.maximum(jnp.sum(mask), 1)
     at = order[at * num // points.shape[0]]
-    k = min(4, points.shape[0])
-    _, sq = nearest_rows(points[at], points, mask, k)
-    other = jnp.min(jnp.where(sq > 0, sq, jnp.inf), axis=1)
-    use = mask[at] & jnp.isfinite(other)
+    rank = 2 * (points.shape[1] - 1)
+    _, sq = nearest_rows(points[at], points, mask, min(2 * rank, points.shape[0]))
+    others = jnp.sort(jnp.where(sq > 0, sq, jnp.inf), axis=1)[:, :rank]
+    other = jnp.max(jnp.where(jnp.isfinite(others), others, 0), axis=1)
+    use = mask[at] & (other > 0)
     spacing = jnp.nanmedian(jnp.where(use, jnp.sqrt(other), jnp.nan))
     return jnp.where(jnp.any(use), spacing, 0)
 
@@ -103,7 +106,7 @@ def _number_of_voxels(keys: Array) -> Array:
 def _voxel_size(points: Array, mask: Array, low: Array, side: Array, cap: int) -> Array:
     """The smallest voxel, to 1 %, that leaves at most `cap` voxels filled."""
 
-    def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: Array, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         small, large = bounds
         middle = jnp.sqrt(small * large)
         fits = _number_of_voxels(_voxel_keys(points, mask, low, middle)) <= cap

@@ -41,8 +41,15 @@ class LocalOptimiser(eqx.Module):
         self, T_target_source: Motion, found: Match, width: Float[Array, ""]
     ) -> Motion:
         """Weighs a match and steps."""
-        weight = self.kernel.weight(found.sq_residual, width) * found.agreement
+        weight = self.weights(found, width)
         return self.step(T_target_source, found, weight, self.residual)
+
+    def weights(self, found: Match, width: Float[Array, ""]) -> Float[Array, " n"]:
+        """Kernel weights, times the agreement of normals where they are used."""
+        weight = self.kernel.weight(found.sq_residual, width)
+        if self.residual.uses_normals:
+            return weight * found.agreement
+        return weight * found.mask
 
     def repeat(
         self, problem: Problem, T_target_source: Motion, widths: Float[Array, " r"]
@@ -92,7 +99,7 @@ class ICP(AbstractRegistrar):
     index: type[AbstractIndex] = eqx.field(default=BruteForce, static=True)
     max_steps: int = eqx.field(default=60, static=True)
     max_points: int = eqx.field(default=4096, static=True)
-    width_end: Array | float = traced(1.5)
+    width_end: Array | float = traced(1.0)
     tolerance: Array | float = traced(1e-5)
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
@@ -124,7 +131,7 @@ class ICP(AbstractRegistrar):
             self.index.build(source.points, source.mask),
             problem.index,
             lax.stop_gradient(T),
-            spacing,
+            jnp.maximum(spacing, median_spacing(source.points, source.mask)),
         )
         status = jnp.where(state.moving, Status.MAX_STEPS, Status.CONVERGED)
         status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
@@ -172,6 +179,5 @@ class ICP(AbstractRegistrar):
     def _last_step(optimiser: LocalOptimiser, problem: Problem, state: _State) -> Array:
         """One step that carries the gradient: correspondences and weights held."""
         found = match(problem, state.T)
-        weight = optimiser.kernel.weight(found.sq_residual, state.width)
-        weight = lax.stop_gradient(weight * found.agreement)
+        weight = lax.stop_gradient(optimiser.weights(found, state.width))
         return optimiser.step(state.T, found, weight, optimiser.residual)

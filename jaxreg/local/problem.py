@@ -56,6 +56,7 @@ class Match(eqx.Module):
         agreement: `(n,)` squared cosine between the two normals, in [0, 1]; one where
             either is undefined, zero for masked points.
         row: `(n,)` rows in the target.
+        mask: `(n,)` False for masked source points.
     """
 
     rotated: Float[Array, "d n"]
@@ -63,6 +64,7 @@ class Match(eqx.Module):
     normal: Float[Array, "d n"]
     agreement: Float[Array, " n"]
     row: Int[Array, " n"]
+    mask: Bool[Array, " n"]
 
     @property
     def sq_residual(self) -> Float[Array, " n"]:
@@ -104,4 +106,4 @@ def match(problem: Problem, T_target_source: Motion) -> Match:
     )
     agreement = jnp.where(known, cosine * cosine, 1)
     agreement = jnp.where(problem.source_mask, agreement, 0)
-    return Match(rotated, residual, normal, agreement, row)
+    return Match(rotated, residual, normal, agreement, row, problem.source_mask)

@@ -7,6 +7,7 @@ b = sum_i w_i J_i^T r_i, and the Gauss-Newton step solves H (v, w) = b.
 """
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,7 +19,13 @@ from jaxreg.local.problem import Match
 
 
 class AbstractResidual(eqx.Module):
-    """What is made small."""
+    """What is made small.
+
+    Attributes:
+        uses_normals: whether matches also count by the agreement of their normals.
+    """
+
+    uses_normals: ClassVar[bool]
 
     @abc.abstractmethod
     def normal_equations(
@@ -29,6 +36,8 @@ class AbstractResidual(eqx.Module):
 
 class PointToPoint(AbstractResidual):
     """q - (R p + t) (PF paper, Eq. 3)."""
+
+    uses_normals: ClassVar[bool] = False
 
     def normal_equations(
         self, match: Match, weight: Float[Array, " n"]
@@ -69,6 +78,7 @@ class PointToPlane(AbstractResidual):
         point_share: weight of the point-to-point residual beside it.
     """
 
+    uses_normals: ClassVar[bool] = True
     point_share: Array | float = traced(0.05)
 
     def normal_equations(

@@ -12,9 +12,9 @@ from jaxreg.neighbours.base import AbstractIndex
 
 
 # A point lies on the other surface if the closest sample is within this many sample
-# spacings, its plane within 0.3 spacings, and the normals within 30 degrees.
-_REACH = 1.5
-_PLANE = 0.3
+# spacings, its plane within 0.2 spacings, and the normals within 30 degrees.
+_REACH = 1.0
+_PLANE = 0.2
 _COSINE_SQ = 0.75
 
 

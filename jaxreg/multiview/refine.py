@@ -23,8 +23,8 @@ from jaxreg.robust import GemanMcClure
 
 
 # Kernel widths in sample spacings: first by the voxel tables, then by exact search.
-_TABLE_WIDTHS = (2.0, 1.7, 1.4, 1.2, 1.0, 1.0)
-_EXACT_WIDTHS = (0.8, 0.7, 0.6, 0.5, 0.5)
+_TABLE_WIDTHS = (1.4, 1.2, 1.0, 0.8, 0.7, 0.7)
+_EXACT_WIDTHS = (0.55, 0.5, 0.4, 0.35, 0.35)
 
 
 @eqx.filter_jit

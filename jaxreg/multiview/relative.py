@@ -21,10 +21,10 @@ class RelativeMotions(eqx.Module):
         status: `(e,)` int32.
     """
 
-    T_i_j: Float[Array, "e D D"]
-    overlap: Float[Array, " e"]
-    inlier_rmse: Float[Array, " e"]
-    status: Int[Array, " e"]
+    T_i_j: Float[Array, "*e D D"]
+    overlap: Float[Array, "*e"]
+    inlier_rmse: Float[Array, "*e"]
+    status: Int[Array, "*e"]
 
 
 def all_pairs(num_scans: int) -> Int[Array, "e 2"]:

@@ -12,7 +12,6 @@ table five times faster from that layout.
 """
 
 import abc
-from typing import Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -43,7 +42,7 @@ class AbstractIndex(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def build(cls, points: Points, mask: Mask | None = None) -> Self:
+    def build(cls, points: Points, mask: Mask | None = None) -> "AbstractIndex":
         """Prepares the search among `(m, d)` points of which `mask` are valid."""
 
     @abc.abstractmethod

@@ -9,8 +9,6 @@ the answer is exact (`python -m bench.neighbours`: 3 to 4 million queries a seco
 among 1,000 targets on one core, against 0.2 to 0.3 with `argmin`).
 """
 
-from typing import Self
-
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -35,7 +33,7 @@ class BruteForce(AbstractIndex):
     mask: Bool[Array, " m"]
 
     @classmethod
-    def build(cls, points: Points, mask: Mask | None = None) -> Self:
+    def build(cls, points: Points, mask: Mask | None = None) -> "BruteForce":
         """Stores the points; there is nothing to prepare."""
         if mask is None:
             mask = jnp.ones(points.shape[:1], dtype=bool)

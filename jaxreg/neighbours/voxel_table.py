@@ -11,8 +11,6 @@ query outside the grid is answered from the nearest cell, with its true distance
 point found.
 """
 
-from typing import Self
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -48,7 +46,7 @@ class VoxelTable(AbstractIndex):
         *,
         resolution: int = 64,
         margin: float = 0.1,
-    ) -> Self:
+    ) -> "VoxelTable":
         """Fills the table.
 
         Args:

@@ -247,7 +247,7 @@ class ParticleFilter(AbstractRegistrar):
         """Many steps on all points, the width falling to the sample spacing."""
         optimiser = LocalOptimiser(PointToPlane(), self.kernel, GaussNewton())
         optimiser = cast_floats(optimiser, T.dtype)
-        widths = spacing * jnp.geomspace(3, 0.75, _REFINE_STEPS, dtype=T.dtype)
+        widths = spacing * jnp.geomspace(2, 0.5, _REFINE_STEPS, dtype=T.dtype)
         refined = lax.map(lambda T: optimiser.repeat(problem, T, widths), T)
         return lie.orthonormalise(refined)
 

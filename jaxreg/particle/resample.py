@@ -34,7 +34,7 @@ def tempered_weights(
         uniform = jnp.full_like(weight, 1 / weight.size)
         return jnp.where(total > 0, weight / jnp.where(total > 0, total, 1), uniform)
 
-    def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: Array, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         cold, hot = bounds
         middle = jnp.sqrt(cold * hot)
         small = effective_sample_size(weights(middle)) < target_size

@@ -14,9 +14,9 @@ class Particles(eqx.Module):
         energy: `(p,)` bounded energy in [0, 1] of the measured pose.
     """
 
-    T_target_source: Float[Array, "p D D"]
-    motion_error: Float[Array, "p k"]
-    energy: Float[Array, " p"]
+    T_target_source: Float[Array, "*p D D"]
+    motion_error: Float[Array, "*p k"]
+    energy: Float[Array, "*p"]
 
     def rows(self, index: Array) -> "Particles":
         """The particles of some rows."""

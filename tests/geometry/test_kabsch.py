@@ -1,0 +1,76 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+from scipy.spatial.transform import Rotation
+
+from jaxreg.geometry.kabsch import kabsch, nearest_rotation
+
+
+N = 12
+
+
+def _problem(seed: int, noise: float):
+    rng = np.random.default_rng(seed)
+    source = rng.standard_normal((N, 3))
+    R = Rotation.random(rng=rng).as_matrix()
+    t = rng.standard_normal(3)
+    target = source @ R.T + t + noise * rng.standard_normal((N, 3))
+    return source, target, rng.uniform(0.1, 1, N), R, t
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_agrees_with_scipy_on_weighted_points(seed):
+    with jax.enable_x64(True):
+        source, target, weight, _, _ = _problem(seed, 0.3)
+        T = kabsch(*map(jnp.asarray, (source, target, weight)))
+        ms, mt = (np.average(x, axis=0, weights=weight) for x in (source, target))
+        R = Rotation.align_vectors(target - mt, source - ms, weight)[0]
+        np.testing.assert_allclose(T[:3, :3], R.as_matrix(), atol=1e-9)
+        np.testing.assert_allclose(T[:3, 3], mt - R.as_matrix() @ ms, atol=1e-9)
+
+
+def test_never_returns_a_reflection():
+    source = np.random.default_rng(0).standard_normal((N, 3)).astype(np.float32)
+    T = kabsch(jnp.asarray(source), jnp.asarray(source * [1, 1, -1], jnp.float32))
+    assert np.linalg.det(np.asarray(T)[:3, :3]) == pytest.approx(1, abs=1e-5)
+
+
+def test_zero_weights_give_the_identity():
+    source, target = jnp.ones((N, 2)), jnp.zeros((N, 2))
+    np.testing.assert_array_equal(kabsch(source, target, jnp.zeros(N)), np.eye(3))
+
+
+def test_gradient_agrees_with_central_differences():
+    with jax.enable_x64(True):
+        source, target, weight, _, _ = map(jnp.asarray, _problem(3, 0.2))
+
+        def fit(*args):
+            return kabsch(*map(jnp.asarray, args))
+
+        check_grads(
+            fit, (source, target, weight), order=1, modes=("fwd", "rev"), rtol=1e-5
+        )
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.0])
+def test_gradient_is_finite_where_singular_values_coincide(scale):
+    # An octahedron has three equal singular values; scale 0 leaves none at all.
+    octahedron = scale * jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
+
+    def cost(p):
+        return jnp.sum(kabsch(p, octahedron)[:3] * jnp.arange(12.0).reshape(3, 4))
+
+    assert jnp.all(jnp.isfinite(jax.grad(cost)(octahedron)))
+
+
+def test_derivative_at_coinciding_singular_values_is_the_true_one():
+    with jax.enable_x64(True):
+        # R(M) at M = I: dR is the skew part of dM.
+        dM = jnp.asarray(np.random.default_rng(0).standard_normal((3, 3)))
+        _, dR = jax.jvp(nearest_rotation, (jnp.eye(3),), (dM,))
+        np.testing.assert_allclose(dR, (dM - dM.T) / 2, atol=1e-12)

@@ -1,0 +1,92 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from jaxreg.geometry import lie
+
+
+def _hat(v: np.ndarray) -> np.ndarray:
+    if len(v) == 3:
+        return np.array([[0, -v[2], v[0]], [v[2], 0, v[1]], [0, 0, 0]])
+    x, y, z, a, b, c = v
+    return np.array([[0, -c, b, x], [c, 0, -a, y], [-b, a, 0, z], [0, 0, 0, 0]])
+
+
+tangents_3 = hnp.arrays(np.float64, 3, elements=st.floats(-1.5, 1.5))
+tangents_6 = hnp.arrays(np.float64, 6, elements=st.floats(-1.5, 1.5))
+
+
+@settings(max_examples=30, deadline=None)
+@given(v=st.one_of(tangents_3, tangents_6))
+def test_exp_is_the_matrix_exponential_translation_first(v):
+    with jax.enable_x64(True):
+        T = lie.exp(jnp.asarray(v))
+        np.testing.assert_allclose(T, expm(_hat(v)), atol=1e-12)
+        np.testing.assert_allclose(lie.log(T), v, atol=1e-9)
+        np.testing.assert_allclose(lie.inverse(T) @ T, np.eye(len(T)), atol=1e-12)
+
+
+@settings(max_examples=20, deadline=None)
+@given(v=tangents_6, w=tangents_6)
+def test_adjoint_moves_a_tangent_through_a_motion(v, w):
+    with jax.enable_x64(True):
+        T, w = lie.exp(jnp.asarray(v)), 0.1 * jnp.asarray(w)
+        left = lie.exp(lie.adjoint(T) @ w)
+        np.testing.assert_allclose(left, T @ lie.exp(w) @ lie.inverse(T), atol=1e-12)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_dtype_in_is_dtype_out_under_strict_promotion(d, dtype):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("strict"):
+        v = jnp.full(lie.tangent_dim(d), 0.3, dtype)
+        T = lie.exp(v)
+        assert T.dtype == lie.log(T).dtype == lie.inverse(T).dtype == dtype
+        assert lie.act(T, jnp.ones((5, d), dtype)).dtype == dtype
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_log_has_finite_gradients_at_the_identity(d):
+    grad = jax.jacobian(lambda v: lie.log(lie.exp(v)))(jnp.zeros(lie.tangent_dim(d)))
+    np.testing.assert_allclose(grad, np.eye(lie.tangent_dim(d)), atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-4, 1.0, 3.0, np.pi - 1e-4, np.pi])
+def test_rotation_angle_is_accurate_near_zero_and_pi(angle):
+    axis = np.array([1.0, 2.0, -2.0]) / 3
+    R3 = Rotation.from_rotvec(angle * axis).as_matrix().astype(np.float32)
+    c, s = np.cos(angle), np.sin(angle)
+    R2 = np.array([[c, -s], [s, c]], np.float32)
+    for R in (R2, R3):
+        assert float(lie.rotation_angle(jnp.asarray(R))) == pytest.approx(
+            angle, abs=2e-6
+        )
+
+
+def test_orthonormalise_gives_the_nearest_rotation():
+    rng = np.random.default_rng(0)
+    R = Rotation.random(rng=rng).as_matrix()
+    T = np.eye(4, dtype=np.float32)
+    T[:3, :3] = R + 0.01 * rng.standard_normal((3, 3))
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    out = np.asarray(lie.orthonormalise(jnp.asarray(T)))
+    np.testing.assert_allclose(out[:3, :3], U @ Vt, atol=1e-5)
+    assert np.linalg.det(out[:3, :3]) == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_random_rotations_are_rotations_and_uniform(d):
+    R = np.asarray(lie.random_rotations(jax.random.key(0), 4000, d, jnp.float32))
+    np.testing.assert_allclose(
+        np.einsum("pij,pkj->pik", R, R), np.broadcast_to(np.eye(d), R.shape), atol=1e-5
+    )
+    np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-5)
+    # Uniform over SO(d): every column has mean zero and covariance I / d.
+    np.testing.assert_allclose(R.mean(0), 0, atol=0.05)
+    np.testing.assert_allclose(np.cov(R[:, :, 0].T), np.eye(d) / d, atol=0.03)

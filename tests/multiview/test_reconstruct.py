@@ -1,0 +1,142 @@
+"""`reconstruct` on scans of a generated sculpture."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import blob, motion, move, pose_error
+
+import jaxreg as jr
+from jaxreg import Status
+from jaxreg.datasets import sculpture_scans
+
+
+FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64, max_points=1024)
+
+
+@pytest.fixture(scope="module")
+def sculpture():
+    scans, truth = sculpture_scans(6, seed=0, points_per_scan=3000)
+    return [s.astype(np.float32) for s in scans], truth
+
+
+def _errors(sol, truth):
+    first = np.linalg.inv(truth[0])
+    return [
+        pose_error(T, first @ T_true)
+        for T, T_true in zip(sol.T_world_i, truth, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def solved(sculpture):
+    calls = []
+    sol = jr.reconstruct(
+        sculpture[0],
+        key=jax.random.key(0),
+        method=FILTER,
+        progress=lambda *call: calls.append(call),
+    )
+    return sol, calls
+
+
+def test_all_scans_are_placed_without_a_guess(sculpture, solved):
+    sol, _ = solved
+    assert int(sol.status) == Status.CONVERGED
+    assert np.all(sol.placed)
+    errors = np.array(_errors(sol, sculpture[1]))
+    assert errors[:, 0].max() < 0.02
+    assert errors[:, 1].max() < 0.004
+    np.testing.assert_array_equal(sol.T_world_i[0], np.eye(4))
+
+
+def test_every_pair_is_reported_with_what_is_known_of_it(sculpture, solved):
+    sol, _ = solved
+    assert sol.graph.num_edges == 15
+    trusted = np.asarray(sol.edge_weight) > 0.5
+    assert trusted.sum() >= 5
+    for e in np.flatnonzero(trusted):
+        i, j = np.asarray(sol.graph.edges[e])
+        truth = np.linalg.inv(sculpture[1][i]) @ sculpture[1][j]
+        assert pose_error(sol.graph.T_i_j[e], truth)[0] < 0.05
+    assert np.all(np.asarray(sol.overlap)[trusted] > 0.12)
+
+
+def test_progress_names_stages_and_ends_at_the_total(solved):
+    _, calls = solved
+    stages = list(dict.fromkeys(stage for stage, _, _ in calls))
+    assert stages == [
+        "preparing scans",
+        "registering pairs",
+        "averaging and refining",
+    ]
+    for stage in stages:
+        done = [d for s, d, _ in calls if s == stage]
+        total = next(t for s, _, t in calls if s == stage)
+        assert done == sorted(done)
+        assert done[-1] == total
+
+
+def test_one_program_under_jit_gives_the_same_poses(sculpture, solved):
+    scans, _ = sculpture
+    rows = max(map(len, scans))
+    padded = np.stack([np.pad(s, ((0, rows - len(s)), (0, 0))) for s in scans])
+    mask = np.arange(rows) < np.array([len(s) for s in scans])[:, None]
+    run = jax.jit(
+        lambda p, m: jr.reconstruct(p, mask=m, key=jax.random.key(0), method=FILTER)
+    )
+    sol = run(jnp.asarray(padded), jnp.asarray(mask))
+    for T, expected in zip(sol.T_world_i, solved[0].T_world_i, strict=True):
+        angle, shift = pose_error(T, expected)
+        assert angle < 2e-3
+        assert shift < 5e-4
+
+
+def test_bad_scans_are_reported_and_the_others_placed(sculpture):
+    scans, truth = sculpture
+    # In place of scan 0: a foreign object. Of scan 3: too few points, and NaN rows.
+    strange = [0.2 * blob(3000, 3), *scans[1:]]
+    strange[3] = np.full((3000, 3), np.nan, np.float32)
+    strange[3][:2] = [[0, 0, 0], [0.1, 0, 0]]
+    sol = jr.reconstruct(strange, key=jax.random.key(0), method=FILTER)
+    assert int(sol.status) == Status.DISCONNECTED
+    assert Status(int(sol.scan_status[0])) == Status.LOW_OVERLAP
+    assert Status(int(sol.scan_status[3])) == Status.TOO_FEW_POINTS
+    np.testing.assert_array_equal(sol.num_dropped, [0, 0, 0, 2998, 0, 0])
+    placed = np.flatnonzero(sol.placed)
+    assert len(placed) >= 3
+    # The world is the frame of the first scan that is placed.
+    first = placed[0]
+    for i in placed:
+        T_true = np.linalg.inv(truth[first]) @ truth[i]
+        assert pose_error(sol.T_world_i[i], T_true)[0] < 0.03
+
+
+def test_curves_in_the_plane():
+    rng = np.random.default_rng(0)
+    world = blob(4000, 2)
+    angle = np.arctan2(world[:, 1], world[:, 0])
+    poses = [motion(s, 2) for s in range(4)]
+    scans = []
+    for k, T in enumerate(poses):
+        seen = np.cos(angle - k * np.pi / 2) > -0.5
+        rows = rng.permutation(np.flatnonzero(seen))[:1500]
+        scans.append(move(np.linalg.inv(T), world[rows]))
+    sol = jr.reconstruct(scans, key=jax.random.key(0), method=FILTER)
+    assert np.all(sol.placed)
+    for T, T_true in zip(sol.T_world_i, poses, strict=True):
+        assert pose_error(T, np.linalg.inv(poses[0]) @ T_true)[0] < 0.03
+
+
+@pytest.mark.parametrize(
+    ("scans", "words"),
+    [
+        ([np.ones((5, 3))], "two or more"),
+        ([np.ones((5, 3)), np.ones((5, 2))], r"scans\[1\].*\(n, 3\)"),
+        (np.ones((5, 3)), "list of two or more"),
+        ([np.ones((5, 3)), np.ones((0, 3))], r"scans\[1\].*no points"),
+    ],
+)
+def test_wrong_scans_are_named(scans, words):
+    with pytest.raises(ValueError, match=words):
+        jr.reconstruct(scans, key=jax.random.key(0))

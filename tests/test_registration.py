@@ -1,0 +1,259 @@
+"""`register` as its users call it."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import blob, motion, move, pose_error
+
+import jaxreg as jr
+from jaxreg import Status
+from jaxreg.local import AbstractRegistrar
+from jaxreg.robust import L1, L2
+
+
+N, M = 500, 800
+FILTER = jr.ParticleFilter(
+    num_prior=256, num_particles=32, num_times=4, num_points=128, num_modes=2
+)
+
+
+def _pair(d: int, seed: int = 0, **kwargs):
+    T = motion(seed, d, **kwargs)
+    return move(np.linalg.inv(T), blob(N, d, seed=1)), blob(M, d, seed=2), T
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_filter_finds_any_rotation_without_a_guess(d):
+    for seed in range(4):
+        source, target, T = _pair(d, seed)
+        sol = jr.register(source, target, FILTER, key=jax.random.key(seed))
+        angle, shift = pose_error(sol.T_target_source, T)
+        assert angle < 0.03, (seed, sol)
+        assert shift < 0.05
+        assert int(sol.status) == Status.CONVERGED
+        assert float(sol.fitness) > 0.7
+
+
+def test_default_method_finds_a_partial_overlap():
+    # The source keeps the side x > -0.2 of the object and gains 15 % of clutter.
+    source, target, T = _pair(3, 5)
+    seen = blob(N, 3, seed=1)[:, 0] > -0.2
+    rng = np.random.default_rng(0)
+    source[~seen] = source[seen][: np.sum(~seen)]
+    source[:75] = rng.uniform(-1, 1, (75, 3)) + source.mean(0)
+    sol = jr.register(source, target, key=jax.random.key(0))
+    angle, shift = pose_error(sol.T_target_source, T)
+    assert angle < 0.04
+    assert shift < 0.06
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize(
+    "method",
+    [
+        jr.ICP(),
+        jr.ICP(jr.PointToPoint(), L2(), jr.ClosedForm(), max_steps=200),
+        jr.ICP(jr.PointToPoint(), L1(), jr.GaussNewton(), max_steps=200),
+        jr.ICP(index=jr.VoxelTable),
+    ],
+    ids=["plane", "besl-mckay", "l1", "table"],
+)
+def test_icp_from_a_near_guess(d, method):
+    source, target, T = _pair(d, 3, angle=0.5)
+    if isinstance(method.residual, jr.PointToPoint):
+        target = blob(4000, d, seed=2)  # sparse samples hold points fast
+    init = motion(9, d, angle=0.12, shift=0.05) @ T
+    sol = jr.register(source, target, method, init=init)
+    angle, shift = pose_error(sol.T_target_source, T)
+    planes = isinstance(method.residual, jr.PointToPlane)
+    assert angle < (0.02 if planes else 0.05)
+    assert shift < 0.03
+    assert int(sol.status) == Status.CONVERGED
+
+
+def test_unit_and_place_of_the_input_do_not_matter():
+    source, target, T = _pair(3, 2)
+    key = jax.random.key(1)
+    sol = jr.register(source, target, FILTER, key=key)
+    in_mm = jr.register(1000 * source, 1000 * target, FILTER, key=key)
+    np.testing.assert_allclose(
+        in_mm.T_target_source[:3, 3] / 1000, sol.T_target_source[:3, 3], atol=1e-3
+    )
+    np.testing.assert_allclose(
+        in_mm.T_target_source[:3, :3], sol.T_target_source[:3, :3], atol=1e-3
+    )
+    far = jr.register(source + np.float32(100), target, FILTER, key=key)
+    R = far.T_target_source[:3, :3]
+    assert pose_error(R, T[:3, :3])[0] < 0.03
+
+
+def test_moving_both_clouds_moves_the_answer():
+    source, target, _ = _pair(3, 4, angle=0.3)
+    A, B = motion(11, 3), motion(12, 3)
+    init = np.eye(4)
+    T = jr.register(source, target, jr.ICP(), init=init).T_target_source
+    init_moved = B @ init @ np.linalg.inv(A)
+    moved = jr.register(move(A, source), move(B, target), jr.ICP(), init=init_moved)
+    expected = B @ np.asarray(T) @ np.linalg.inv(A)
+    np.testing.assert_allclose(moved.T_target_source, expected, atol=2e-3)
+
+
+def test_same_key_same_bits_and_a_batch_equals_its_pairs():
+    pairs = [_pair(3, s)[:2] for s in (0, 1)]
+    source, target = (np.stack(x) for x in zip(*pairs, strict=True))
+    key = jax.random.key(7)
+    first = jr.register(source, target, FILTER, key=key)
+    again = jr.register(source, target, FILTER, key=key)
+    np.testing.assert_array_equal(first.T_target_source, again.T_target_source)
+    keys = jax.random.split(key, 2)
+    for k in range(2):
+        single = jr.register(source[k], target[k], FILTER, key=keys[k])
+        assert pose_error(first.T_target_source[k], single.T_target_source)[0] < 1e-3
+
+
+def test_jit_vmap_and_pickle():
+    source, target, T = _pair(3, 3, angle=0.5)
+    init = jnp.asarray(motion(9, 3, angle=0.1, shift=0.05) @ T, jnp.float32)
+
+    @jax.jit
+    def solve(s, t, T0):
+        return jr.register(s, t, jr.ICP(), init=T0)
+
+    plain = jr.register(source, target, jr.ICP(), init=init)
+    inside = solve(source, target, init)
+    np.testing.assert_allclose(inside.T_target_source, plain.T_target_source, atol=1e-4)
+    batched = jax.vmap(solve, (None, None, 0))(source, target, jnp.stack([init, init]))
+    np.testing.assert_allclose(
+        batched.T_target_source[1], plain.T_target_source, atol=1e-4
+    )
+    back = pickle.loads(pickle.dumps(jax.device_get(plain)))
+    np.testing.assert_array_equal(back.T_target_source, plain.T_target_source)
+
+
+def test_icp_gradient_agrees_with_central_differences():
+    # Shifting the whole target by s shifts the answer by s; stretching it does not.
+    with jax.enable_x64(True):
+        source, target, T = _pair(3, 3, angle=0.3)
+        source, target = source.astype(float), jnp.asarray(target, float)
+        method = jr.ICP(jr.PointToPoint(), L2(), jr.ClosedForm())
+        noise = jnp.asarray(np.random.default_rng(0).standard_normal((M, 3)))
+
+        def x(s):
+            sol = jr.register(source, target + s * noise, method, init=T)
+            return sol.T_target_source[0, 3]
+
+        step = 1e-6
+        numeric = (x(step) - x(-step)) / (2 * step)
+        assert float(jax.grad(x)(0.0)) == pytest.approx(float(numeric), rel=1e-4)
+
+
+def test_masked_and_non_finite_rows_do_not_count():
+    source, target, T = _pair(3, 3, angle=0.5)
+    init = motion(9, 3, angle=0.1, shift=0.05) @ T
+    clean = jr.register(source, target, jr.ICP(), init=init)
+    dirty = source.copy()
+    dirty = np.concatenate([dirty, np.full((40, 3), np.nan, np.float32)])
+    dirty[-1] = np.inf
+    found = jr.register(dirty, target, jr.ICP(), init=init)
+    np.testing.assert_allclose(found.T_target_source, clean.T_target_source, atol=1e-4)
+    junk = np.concatenate([source, np.full((40, 3), 50, np.float32)])
+    found = jr.register(
+        junk, target, jr.ICP(), init=init, source_mask=np.arange(N + 40) < N
+    )
+    np.testing.assert_allclose(found.T_target_source, clean.T_target_source, atol=1e-4)
+
+
+def test_statuses():
+    source, target, _ = _pair(3)
+    key = jax.random.key(0)
+    line = np.linspace(0, 1, N, dtype=np.float32)[:, None] * np.ones(3, np.float32)
+
+    def status(s, t, method: AbstractRegistrar = FILTER):
+        sol = jr.register(s, t, method, key=key)
+        assert np.isfinite(np.asarray(sol.T_target_source)).all()
+        return Status(int(sol.status))
+
+    point = np.ones_like(source)
+    assert status(point, target) == Status.TOO_FEW_POINTS
+    assert status(source, np.full_like(target, np.nan)) == Status.TOO_FEW_POINTS
+    assert status(line, target) == Status.LOW_OVERLAP
+    ball = np.random.default_rng(0).standard_normal((M, 3)).astype(np.float32)
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    assert status(ball[:N], ball[::-1]) == Status.AMBIGUOUS
+    assert status(source, target, jr.ICP(max_steps=1)) == Status.MAX_STEPS
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"source": np.ones((5, 4))}, ValueError, r"source.*\(n, 2\) or \(n, 3\)"),
+        ({"target": np.ones((5, 2))}, ValueError, "target.*dimension 3"),
+        ({"source": np.ones((0, 3))}, ValueError, "source.*no points"),
+        ({"source": np.ones((5, 3), np.float16)}, TypeError, "source.*float16"),
+        ({"source": np.ones((5, 3), complex)}, TypeError, "source.*complex"),
+        ({"source": [["a", "b", "c"]]}, TypeError, "source.*numbers"),
+        ({"source_mask": np.ones(4, bool)}, ValueError, "source_mask.*shape"),
+        ({"target_mask": np.ones(M)}, TypeError, "target_mask.*boolean"),
+        ({"init": np.eye(3)}, ValueError, r"init.*\(\.\.\., 4, 4\)"),
+        ({"key": jnp.ones(3)}, TypeError, "key.*float32"),
+        ({"key": None}, ValueError, r"key.*jax\.random\.key"),
+        ({"method": "icp"}, TypeError, "method.*str"),
+    ],
+)
+def test_wrong_arguments_are_named(change, error, words):
+    source, target, _ = _pair(3)
+    arguments = {
+        "source": source,
+        "target": target,
+        "method": FILTER,
+        "key": jax.random.key(0),
+    }
+    with pytest.raises(error, match=words):
+        jr.register(**{**arguments, **change})
+
+
+@pytest.mark.parametrize("field", ["num_prior", "num_particles", "inner_steps"])
+def test_counts_that_leave_nothing_to_do_are_refused(field):
+    with pytest.raises(ValueError, match=field):
+        jr.ParticleFilter(**{field: 0})  # pyright: ignore[reportArgumentType]
+
+
+def test_integer_points_lists_and_the_older_keys_are_taken():
+    square = [[0, 0], [4, 0], [4, 1], [0, 2], [1, 3], [3, 2]]
+    sol = jr.register(square, square, FILTER, key=jax.random.PRNGKey(0))
+    assert sol.T_target_source.dtype == jnp.float32
+
+
+def test_float64_stays_float64():
+    with jax.enable_x64(True):
+        source, target, T = _pair(3, 3, angle=0.3)
+        sol = jr.register(source.astype(float), target.astype(float), jr.ICP(), init=T)
+        assert sol.T_target_source.dtype == jnp.float64
+        low = jr.register(source, target, jr.ICP(), init=T)
+        assert {x.dtype for x in jax.tree.leaves(low) if x.dtype.kind == "f"} == {
+            np.dtype(np.float32)
+        }
+
+
+def test_changing_a_number_compiles_nothing():
+    source, target, _ = _pair(3)
+    traces = []
+
+    @jax.jit
+    def solve(method):
+        traces.append(1)
+        return jr.register(source, target, method, init=np.eye(4)).fitness
+
+    for width in (1.5, 2.0, 3.0):
+        solve(jr.ICP(width_end=width))
+    assert len(traces) == 1
+
+
+def test_repr_is_one_line():
+    source, target, T = _pair(3, 3, angle=0.3)
+    text = repr(jr.register(source, target, jr.ICP(), init=T))
+    assert "CONVERGED" in text
+    assert "\n" not in text
