@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import lie
 from jaxreg.geometry.kabsch import nearest_rotation
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
 
 
 Align = Literal["first", "best", "none"]
@@ -104,31 +104,6 @@ def _mean(x: Array, mask: Array | None) -> Array:
         return jnp.mean(x)
     count = jnp.maximum(jnp.sum(mask), 1).astype(x.dtype)
     return jnp.sum(jnp.where(mask, x, 0)) / count
-
-
-def chordal_weights(
-    graph: PoseGraph,
-) -> tuple[Float[Array, " e"], Float[Array, " e"]]:
-    """SE-Sync's precisions kappa (rotation) and tau (translation) of each edge.
-
-    From the blocks I_tt and I_rr of the information: in 3D tau = 3 / tr(inv(I_tt)) and
-    kappa = 3 / (2 tr(inv(I_rr))), in 2D tau = 2 / tr(inv(I_tt)) and kappa = I_rr. Both
-    are times the prior weight, and 1 without information; 0 where masked.
-    """
-    if graph.information is None:
-        return graph.weight, graph.weight
-    d = graph.dim
-    real = graph.mask & (graph.weight > 0)
-    k = graph.information.shape[-1]
-    eye = jnp.eye(k, dtype=graph.weight.dtype)
-    info = jnp.where(real[:, None, None], graph.information, eye)
-    tau = d / jnp.trace(jnp.linalg.inv(info[:, :d, :d]), axis1=-2, axis2=-1)
-    if d == 2:
-        kappa = info[:, 2, 2]
-    else:
-        inverse = jnp.linalg.inv(info[:, d:, d:])
-        kappa = 1.5 / jnp.trace(inverse, axis1=-2, axis2=-1)
-    return graph.weight * kappa, graph.weight * tau
 
 
 def chordal_objective(

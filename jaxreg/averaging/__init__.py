@@ -3,6 +3,7 @@
 from jaxreg.averaging.average import average as average
 from jaxreg.averaging.base import AbstractAverager as AbstractAverager
 from jaxreg.averaging.base import AveragingSolution as AveragingSolution
+from jaxreg.averaging.consensus import CycleConsensus as CycleConsensus
 from jaxreg.averaging.correntropy import Correntropy as Correntropy
 from jaxreg.averaging.plain import MotionAveraging as MotionAveraging
 from jaxreg.averaging.plain import WeightedMotionAveraging as WeightedMotionAveraging

@@ -21,19 +21,37 @@ from jaxreg.averaging.base import (
     solution,
     weighted_mean,
 )
-from jaxreg.averaging.iterate import iterate
+from jaxreg.averaging.consensus import CycleConsensus
+from jaxreg.averaging.gauss_newton import gauss_newton_gradients, gauss_newton_step
+from jaxreg.averaging.iterate import (
+    Iterated,
+    averaging_gradients,
+    averaging_step,
+    iterate,
+)
+from jaxreg.averaging.laplacian import DENSE_LIMIT
 from jaxreg.averaging.plain import check_rows, scaled_rows
-from jaxreg.averaging.tree import SpanningTree, start
+from jaxreg.averaging.scales import annealed_width, first_width, gaussian_trust
+from jaxreg.averaging.tree import start
 from jaxreg.graph.pose_graph import PoseGraph
 
 
 class Correntropy(AbstractAverager):
     """Robust motion averaging: edges count by a Gaussian of their residual (Eq. 12).
 
+    The default needs no start, no noise level and no tuning: a consensus of cycles as
+    the start, a kernel whose widths for rotation and translation shrink to three
+    standard deviations of the noise that the agreeing edges show, and, up to
+    `DENSE_LIMIT` frames, Gauss-Newton steps at the end in which each part counts at
+    its precision, or by `information` where the graph has it. `width="paper"` is the
+    published Algorithm 1.
+
     Attributes:
-        alpha: kernel width over the mean residual, sigma_k = alpha e_k (Eq. 22).
+        width: "annealed", or "paper" for sigma_k = alpha e_k with the mean residual
+            e_k of Eq. 22 (static).
+        alpha: kernel width over the mean residual, for "paper".
         rows: "sqrt" scales rows by the root of the weight, as half-quadratic theory
-            asks; "weight" by the weight itself, as printed in Eq. 17.
+            asks; "weight" by the weight itself, as printed in Eq. 17 (static).
         max_steps: largest number of steps (static).
         tolerance: stop below this change, radians and share of the size of the scene.
         initialiser: finds the start when `init` is None.
@@ -41,19 +59,23 @@ class Correntropy(AbstractAverager):
     Lengths are measured in the graph's own length scale, so another unit does not
     change the answer.
 
-    Gradients: implicit at the fixed point with respect to `T_i_j` and `weight`; the
-    kernel width and the start are cut.
+    Gradients: implicit at the fixed point with respect to `T_i_j`, `weight` and
+    `information`; kernel widths, length scale and start are cut.
     """
 
-    width: Literal["paper"] = eqx.field(static=True, default="paper")
+    width: Literal["annealed", "paper"] = eqx.field(static=True, default="annealed")
     alpha: Array | float = traced(1.0)
     rows: Literal["sqrt", "weight"] = eqx.field(static=True, default="sqrt")
     max_steps: int = eqx.field(static=True, default=100)
     tolerance: Array | float = traced(1e-8)
-    initialiser: AbstractAverager = SpanningTree()
+    initialiser: AbstractAverager = CycleConsensus()
 
     def __check_init__(self) -> None:
         check_rows(self.rows)
+        if self.width not in ("annealed", "paper"):
+            raise ValueError(
+                f"width: wanted 'annealed' or 'paper', found {self.width!r}."
+            )
 
     def solve(
         self,
@@ -62,24 +84,9 @@ class Correntropy(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Averages a prepared graph."""
-        scale = length_scale(graph)
-        root_two = jnp.sqrt(jnp.asarray(2, scale.dtype))
-
-        def adaptive(g: PoseGraph, T: Array) -> Array:
-            e = weighted_mean(frobenius(g, T, scale), g.weight)
-            sigma = self.alpha * jnp.maximum(e, 64 * jnp.finfo(e.dtype).eps)
-            # The Frobenius norm of a small rotation is sqrt(2) times its angle.
-            return jnp.stack([sigma * scale, sigma / root_two])
-
-        end = iterate(
-            graph,
-            start(self.initialiser, graph, init, key),
-            adaptive,
-            gaussian_trust,
-            scaled_rows(self.rows),
-            max_steps=self.max_steps,
-            tolerance=self.tolerance,
-        )
+        T_start = start(self.initialiser, graph, init, key)
+        solve = self._paper if self.width == "paper" else self._annealed
+        end = solve(graph, T_start)
         return solution(
             graph,
             end.T_world_i,
@@ -89,11 +96,54 @@ class Correntropy(AbstractAverager):
             num_steps=end.num_steps,
         )
 
+    def _paper(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
+        scale = length_scale(graph)
+        root_two = jnp.sqrt(jnp.asarray(2, scale.dtype))
 
-def gaussian_trust(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"], width: Float[Array, "2"]
-) -> Float[Array, " e"]:
-    """G_sigma of the residual of each edge (Eq. 12); widths are (length, angle)."""
-    rotation, translation = graph.differences(T_world_i)
-    sq = translation / width[0] ** 2 + rotation / (2 * width[1] ** 2)
-    return jnp.exp(-sq / 2)
+        def adaptive(g: PoseGraph, T: Array, _: Array) -> Array:
+            e = weighted_mean(frobenius(g, T, scale), g.weight)
+            sigma = self.alpha * jnp.maximum(e, 64 * jnp.finfo(e.dtype).eps)
+            # The Frobenius norm of a small rotation is sqrt(2) times its angle.
+            return jnp.stack([sigma * scale, sigma / root_two])
+
+        rows = scaled_rows(self.rows)
+        end = iterate(
+            graph,
+            T_start,
+            jnp.full((2,), jnp.inf, scale.dtype),
+            adaptive,
+            gaussian_trust,
+            averaging_step(rows),
+            max_steps=self.max_steps,
+            tolerance=self.tolerance,
+        )
+        return averaging_gradients(graph, end, gaussian_trust, rows)
+
+    def _annealed(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
+        rows = scaled_rows(self.rows)
+        finish = graph.num_poses <= DENSE_LIMIT
+        end = iterate(
+            graph,
+            T_start,
+            first_width(graph, T_start),
+            annealed_width,
+            gaussian_trust,
+            averaging_step(rows),
+            max_steps=self.max_steps,
+            # Gauss-Newton does the last digits better.
+            tolerance=1e-2 if finish else self.tolerance,
+        )
+        if not finish:
+            return averaging_gradients(graph, end, gaussian_trust, rows)
+        last = iterate(
+            graph,
+            end.T_world_i,
+            end.width,
+            annealed_width,
+            gaussian_trust,
+            gauss_newton_step,
+            max_steps=self.max_steps,
+            tolerance=self.tolerance,
+        )
+        last = last._replace(num_steps=end.num_steps + last.num_steps)
+        return gauss_newton_gradients(graph, last, gaussian_trust)

@@ -1,4 +1,4 @@
-"""The loop of motion averaging: residual motions, one Laplacian solve, left update."""
+"""The loop of motion averaging: kernel width, trust, one solve, updated poses."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,17 +9,19 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.averaging.base import length_scale
 from jaxreg.averaging.implicit import differentiable
-from jaxreg.averaging.laplacian import solve_flow
+from jaxreg.averaging.laplacian import divergence, solve_flow
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, product
 
 
-#: Kernel widths `(2,)` at given poses: translation (length), rotation (radians).
-WidthOf = Callable[[PoseGraph, Array], Array]
+#: Kernel widths `(2,)` (length, radians) at given poses, from the widths before.
+WidthOf = Callable[[PoseGraph, Array, Array], Array]
 #: Trust of each edge `(e,)` at given poses and widths.
 TrustOf = Callable[[PoseGraph, Array, Array], Array]
 #: Weights `(e,)` of the Laplacian from prior weight and trust.
 RowsOf = Callable[[PoseGraph, Array], Array]
+#: New poses from poses, trust and widths.
+Step = Callable[[PoseGraph, Array, Array, Array], Array]
 
 
 class Iterated(NamedTuple):
@@ -42,72 +44,88 @@ class _State(NamedTuple):
 def nearby_rotation(T: Float[Array, "*b D D"]) -> Float[Array, "*b D D"]:
     """One Newton step back onto SE(d), exact to second order in the departure."""
     R = lie.rotation(T)
+    gram = product(jnp.swapaxes(R, -1, -2), R)
     eye = jnp.eye(R.shape[-1], dtype=R.dtype)
-    return lie.compose(
-        R @ (1.5 * eye - 0.5 * jnp.swapaxes(R, -1, -2) @ R), lie.translation(T)
-    )
+    return lie.compose(product(R, 1.5 * eye - 0.5 * gram), lie.translation(T))
 
 
-def left_update(
-    tangent: Float[Array, "v k"], T_world_i: Float[Array, "v D D"]
-) -> Float[Array, "v D D"]:
-    """exp(dm_i) T_world_i: Eq. 21 with the update on the side that Eq. 14 asks for.
+def averaging_step(rows_of: RowsOf) -> Step:
+    """One weighted step of motion averaging (Eq. 14-20), updated on the left.
 
-    As printed, on the right, the iteration diverges.
+    T_world_i <- exp(dm_i) T_world_i: Eq. 21 with the update on the side that Eq. 14
+    asks for. As printed, on the right, the iteration diverges.
     """
-    return nearby_rotation(lie.exp(tangent) @ T_world_i)
+
+    def step(graph: PoseGraph, T: Array, trust: Array, width: Array) -> Array:
+        flow = lie.log(graph.residual_motions(T))
+        weight = rows_of(graph, trust)
+        tangent = solve_flow(graph.edges, weight, flow, graph.num_poses)
+        return nearby_rotation(product(lie.exp(tangent), T))
+
+    return step
+
+
+def averaging_gradients(
+    graph: PoseGraph, end: Iterated, trust_of: TrustOf, rows_of: RowsOf
+) -> Iterated:
+    """The same result with derivatives by the balance of flows at the fixed point."""
+    fixed = jax.lax.stop_gradient(graph)
+    held = rows_of(fixed, end.trust)
+    top = jnp.max(held)
+    held = held / jnp.where(top > 0, top, 1)
+
+    def imbalance(g: PoseGraph, T: Array) -> Array:
+        weight = rows_of(g, trust_of(g, T, end.width)) / jnp.where(top > 0, top, 1)
+        flow = weight[:, None] * lie.log(g.residual_motions(T))
+        return divergence(g.edges, flow, g.num_poses)
+
+    T = differentiable(graph, end.T_world_i, imbalance, held)
+    return end._replace(T_world_i=T, trust=trust_of(graph, T, end.width))
 
 
 def iterate(
     graph: PoseGraph,
     T_start: Float[Array, "v D D"],
+    width_start: Float[Array, "2"],
     width_of: WidthOf,
     trust_of: TrustOf,
-    rows_of: RowsOf,
+    step_of: Step,
     *,
     max_steps: int,
     tolerance: Array | float,
 ) -> Iterated:
-    """Alternates weights and weighted averaging until the poses stand still.
+    """Alternates weights and steps until widths and poses stand still.
 
-    Stops when no rotation moves by more than `tolerance` radians and no position by
-    more than `tolerance` of the size of the scene, or after `max_steps`.
-
-    Gradients: implicit at the fixed point with respect to `graph.T_i_j` and
-    `graph.weight`; the kernel width and the start are cut.
+    Stops when no rotation moves by more than `tolerance` radians, no position by more
+    than `tolerance` of the size of the scene, and no width by more than a thousandth
+    and its shrinking, or after `max_steps`. Nothing is differentiable here; the caller
+    attaches the derivatives of the fixed point.
     """
-    fixed = jax.lax.stop_gradient(graph)
+    graph, T_start, width_start, tolerance = jax.lax.stop_gradient(
+        (graph, T_start, width_start, tolerance)
+    )
     scale = length_scale(graph)
-    eps = 32 * jnp.finfo(T_start.dtype).eps
-    limit = jnp.maximum(jax.lax.stop_gradient(tolerance), eps)
+    limit = jnp.maximum(tolerance, 32 * jnp.finfo(T_start.dtype).eps)
 
     def unfinished(s: _State) -> Array:
         return (s.change > limit) & (s.step < max_steps)
 
     def step(s: _State) -> _State:
-        width = width_of(fixed, s.T)
-        weight = rows_of(fixed, trust_of(fixed, s.T, width))
-        flow = lie.log(fixed.residual_motions(s.T))
-        tangent = solve_flow(fixed.edges, weight, flow, fixed.num_poses)
-        T = left_update(tangent, s.T)
-        return _State(T, width, pose_change(s.T, T, scale), s.step + 1)
+        width = width_of(graph, s.T, s.width)
+        T = step_of(graph, s.T, trust_of(graph, s.T, width), width)
+        shrinking = jnp.any(width < 0.999 * s.width) & jnp.all(jnp.isfinite(s.width))
+        change = pose_change(s.T, T, scale) + jnp.where(shrinking, limit, 0)
+        return _State(T, width, change, s.step + 1)
 
-    T_start = jax.lax.stop_gradient(T_start)
     start = _State(
         T=T_start,
-        width=jax.lax.stop_gradient(width_of(fixed, T_start)),
+        width=width_start,
         change=jnp.asarray(jnp.inf, T_start.dtype),
         step=jnp.asarray(0, jnp.int32),
     )
     end = jax.lax.while_loop(unfinished, step, start)
-    width = jax.lax.stop_gradient(end.width)
-
-    def stationarity_weight(g: PoseGraph, T: Array) -> Array:
-        return rows_of(g, trust_of(g, T, width))
-
-    T = differentiable(graph, end.T, stationarity_weight)
-    trust = trust_of(graph, T, width)
-    return Iterated(T, trust, width, end.change <= limit, end.step)
+    trust = trust_of(graph, end.T, end.width)
+    return Iterated(end.T, trust, end.width, end.change <= limit, end.step)
 
 
 def pose_change(T_old: Array, T_new: Array, scale: Array) -> Array:

@@ -67,12 +67,15 @@ def laplacian(
     return L.at[0].set(0).at[:, 0].set(0).at[0, 0].set(1)
 
 
-class _Preconditioner(NamedTuple):
+class TwoLevel(NamedTuple):
+    """Exact solves in blocks plus a coarse solve: call it on `(v, k)`."""
+
     blocks: Array  # (b, s, s) inverses of the diagonal blocks
     coarse: Array  # (b, b) inverse of the Galerkin matrix
     held: Array  # (v, 1) 1 for the frames that some weight holds, 0 for frame 0
 
     def __call__(self, r: Array) -> Array:
+        """Approximately solves for right-hand sides r."""
         num_poses, k = r.shape
         b, s, _ = self.blocks.shape
         padded = jnp.pad(r, [(0, b * s - num_poses), (0, 0)]).reshape(b, s, k)
@@ -82,7 +85,8 @@ class _Preconditioner(NamedTuple):
         return both.reshape(b * s, k)[:num_poses] * self.held
 
 
-def _precondition(edges: Array, weight: Array, num_poses: int) -> _Preconditioner:
+def two_level(edges: Array, weight: Array, num_poses: int) -> TwoLevel:
+    """An approximate inverse of the Laplacian, with frame 0 held."""
     s = _BLOCK
     b = -(-num_poses // s)
     i, j = edges[:, 0], edges[:, 1]
@@ -101,7 +105,7 @@ def _precondition(edges: Array, weight: Array, num_poses: int) -> _Preconditione
     coarse = coarse.at[0, 0].add(ground)
     touched = jnp.zeros((num_poses,), weight.dtype).at[i].add(weight).at[j].add(weight)
     held = (touched > 0).at[0].set(False).astype(weight.dtype)[:, None]
-    return _Preconditioner(_ridged_inverse(blocks), _ridged_inverse(coarse), held)
+    return TwoLevel(_ridged_inverse(blocks), _ridged_inverse(coarse), held)
 
 
 def _ridged_inverse(A: Array) -> Array:
@@ -128,7 +132,7 @@ def _conjugate_gradients(edges: Array, weight: Array, rhs: Array) -> Array:
     """Preconditioned conjugate gradients, the k columns side by side."""
     num_poses = rhs.shape[0]
     i, j = edges[:, 0], edges[:, 1]
-    precondition = _precondition(edges, weight, num_poses)
+    precondition = two_level(edges, weight, num_poses)
 
     def apply(x: Array) -> Array:
         return (

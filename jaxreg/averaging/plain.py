@@ -13,7 +13,12 @@ from jaxtyping import Array, Float
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
-from jaxreg.averaging.iterate import RowsOf, iterate
+from jaxreg.averaging.iterate import (
+    RowsOf,
+    averaging_gradients,
+    averaging_step,
+    iterate,
+)
 from jaxreg.averaging.tree import SpanningTree, start
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -108,8 +113,8 @@ def _least_squares(
     max_steps: int,
     tolerance: Array | float,
 ) -> AveragingSolution:
-    def no_width(g: PoseGraph, T: Array) -> Array:
-        return jnp.full((2,), jnp.inf, T.dtype)
+    def same_width(g: PoseGraph, T: Array, width: Array) -> Array:
+        return width
 
     def full_trust(g: PoseGraph, T: Array, width: Array) -> Array:
         return jnp.ones_like(g.weight)
@@ -117,12 +122,14 @@ def _least_squares(
     end = iterate(
         graph,
         T_start,
-        no_width,
+        jnp.full((2,), jnp.inf, T_start.dtype),
+        same_width,
         full_trust,
-        rows,
+        averaging_step(rows),
         max_steps=max_steps,
         tolerance=tolerance,
     )
+    end = averaging_gradients(graph, end, full_trust, rows)
     return solution(
         graph, end.T_world_i, converged=end.converged, num_steps=end.num_steps
     )

@@ -17,6 +17,13 @@ from jaxreg.geometry import lie
 ROTATION_TOLERANCE = 1e-2
 
 
+def product(
+    A: Float[Array, "*#b p q"], B: Float[Array, "*#b q r"]
+) -> Float[Array, "*b p r"]:
+    """A @ B for many small matrices: a broadcast sum is several times faster on CPU."""
+    return jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2)
+
+
 class PoseGraph(eqx.Module):
     """Edges (i, j) that hold `T_i_j`, which maps frame j into frame i.
 
@@ -145,7 +152,8 @@ class PoseGraph(eqx.Module):
     ) -> Float[Array, "e D D"]:
         """`T_world_i T_i_j inv(T_world_j)` of each edge (MCC paper, Eq. 14)."""
         i, j = self.edges[:, 0], self.edges[:, 1]
-        return T_world_i[i] @ self.T_i_j @ lie.inverse(T_world_i)[j]
+        half = product(T_world_i[i], self.T_i_j)
+        return product(half, lie.inverse(T_world_i)[j])
 
     def differences(
         self, T_world_i: Float[Array, "v D D"]
@@ -157,7 +165,7 @@ class PoseGraph(eqx.Module):
             masked.
         """
         i, j = self.edges[:, 0], self.edges[:, 1]
-        gap = self.T_i_j - lie.inverse(T_world_i)[i] @ T_world_i[j]
+        gap = self.T_i_j - product(lie.inverse(T_world_i)[i], T_world_i[j])
         gap = jnp.where(self.mask[:, None, None], gap, 0)
         return (
             jnp.sum(lie.rotation(gap) ** 2, axis=(-2, -1)),
@@ -167,8 +175,8 @@ class PoseGraph(eqx.Module):
     def tangent_errors(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, "e k"]:
         """`log(inv(T_i_j) inv(T_world_i) T_world_j)`, the error of g2o and GTSAM."""
         i, j = self.edges[:, 0], self.edges[:, 1]
-        predicted = lie.inverse(T_world_i)[i] @ T_world_i[j]
-        return lie.log(lie.inverse(self.T_i_j) @ predicted)
+        predicted = product(lie.inverse(T_world_i)[i], T_world_i[j])
+        return lie.log(product(lie.inverse(self.T_i_j), predicted))
 
     def __repr__(self) -> str:
         batch = self.edges.shape[:-2]
@@ -185,6 +193,31 @@ class EdgeError(ValueError):
     def __init__(self, message: str, edge: int):
         super().__init__(message)
         self.edge = edge
+
+
+def chordal_weights(
+    graph: PoseGraph,
+) -> tuple[Float[Array, " e"], Float[Array, " e"]]:
+    """SE-Sync's precisions kappa (rotation) and tau (translation) of each edge.
+
+    From the blocks I_tt and I_rr of the information: in 3D tau = 3 / tr(inv(I_tt)) and
+    kappa = 3 / (2 tr(inv(I_rr))), in 2D tau = 2 / tr(inv(I_tt)) and kappa = I_rr. Both
+    are times the prior weight, and 1 without information; 0 where masked.
+    """
+    if graph.information is None:
+        return graph.weight, graph.weight
+    d = graph.dim
+    real = graph.mask & (graph.weight > 0)
+    k = graph.information.shape[-1]
+    eye = jnp.eye(k, dtype=graph.weight.dtype)
+    info = jnp.where(real[:, None, None], graph.information, eye)
+    tau = d / jnp.trace(jnp.linalg.inv(info[:, :d, :d]), axis1=-2, axis2=-1)
+    if d == 2:
+        kappa = info[:, 2, 2]
+    else:
+        inverse = jnp.linalg.inv(info[:, d:, d:])
+        kappa = 1.5 / jnp.trace(inverse, axis1=-2, axis2=-1)
+    return graph.weight * kappa, graph.weight * tau
 
 
 def is_concrete(x: Any) -> bool:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import product
 
 
 class Forest(eqx.Module):
@@ -90,7 +91,7 @@ def maximum_spanning_tree(
         start,
     )
     reached = end.component == end.component[0]
-    T_world_i = lie.inverse(end.T_root_i[0]) @ end.T_root_i
+    T_world_i = product(lie.inverse(end.T_root_i[0]), end.T_root_i)
     eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
     T_world_i = jnp.where(reached[:, None, None], T_world_i, eye).at[0].set(eye)
     return Forest(T_world_i, reached, end.component, end.in_tree)
@@ -123,7 +124,7 @@ def _join_components(
     hooks = found & ~mutual
     parent = jnp.where(hooks, other, frames)
     X_i, X_j = state.T_root_i[i[e]], state.T_root_i[j[e]]
-    T_ri_rj = X_i @ T_i_j[e] @ lie.inverse(X_j)
+    T_ri_rj = product(product(X_i, T_i_j[e]), lie.inverse(X_j))
     T_parent_c = jnp.where(outward[:, None, None], lie.inverse(T_ri_rj), T_ri_rj)
     eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
     T_parent_c = jnp.where(hooks[:, None, None], T_parent_c, eye)
@@ -131,7 +132,7 @@ def _join_components(
     in_tree = state.in_tree.at[jnp.where(hooks, best, num_edges)].set(True, mode="drop")
     return _Boruvka(
         root[state.component],
-        T_top_c[state.component] @ state.T_root_i,
+        product(T_top_c[state.component], state.T_root_i),
         in_tree,
         jnp.any(hooks),
     )
@@ -149,7 +150,7 @@ def follow(
 
     def jump(state: tuple[Array, Array]) -> tuple[Array, Array]:
         up, T = state
-        return up[up], T[up] @ T
+        return up[up], product(T[up], T)
 
     def unfinished(state: tuple[Array, Array]) -> Array:
         return jnp.any(state[0] != state[0][state[0]])

@@ -13,9 +13,10 @@ from jaxreg.averaging import (
     WeightedMotionAveraging,
     average,
 )
-from jaxreg.averaging.correntropy import gaussian_trust
-from jaxreg.averaging.iterate import iterate
+from jaxreg.averaging.gauss_newton import gauss_newton_gradients, gauss_newton_step
+from jaxreg.averaging.iterate import averaging_gradients, averaging_step, iterate
 from jaxreg.averaging.plain import scaled_rows
+from jaxreg.averaging.scales import gaussian_trust
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_error, translation_error
 from tests.averaging.graphs import random_graph
@@ -27,7 +28,8 @@ METHODS = {
     "paths": SpanningTree(by="path"),
     "plain": MotionAveraging(),
     "weighted": WeightedMotionAveraging(),
-    "correntropy": Correntropy(width="paper"),
+    "correntropy": Correntropy(width="paper", initialiser=SpanningTree()),
+    "annealed": Correntropy(),
 }
 
 
@@ -58,7 +60,7 @@ def test_exact_motions_are_recovered_exactly_at_any_gauge(name, d):
     np.testing.assert_allclose(moved.T_world_i, gauge, atol=2e-5)
 
 
-@pytest.mark.parametrize("name", ["plain", "correntropy"])
+@pytest.mark.parametrize("name", ["plain", "correntropy", "annealed"])
 def test_order_direction_and_unit_of_the_motions_do_not_matter(name):
     X, edges, T, bad = random_graph(N, H, 0.1, 1)
     with jax.enable_x64(True):
@@ -73,8 +75,9 @@ def test_order_direction_and_unit_of_the_motions_do_not_matter(name):
             (order % 2 == 0)[:, None, None], np.linalg.inv(T[order]), T[order]
         )
         other = average(PoseGraph.from_edges(swapped, inverted), method, init=init)
-        # Swapping i and j changes Eq. 22 only by which end measures the translation.
-        tolerance = 1e-6 if name == "plain" else 2e-3
+        # Swapping i and j changes which end measures the translation: a share of the
+        # noise (9e-3) for methods that weigh rotation and translation apart.
+        tolerance = {"plain": 1e-6, "correntropy": 2e-3, "annealed": 5e-3}[name]
         np.testing.assert_allclose(other.T_world_i, base.T_world_i, atol=tolerance)
         mm = np.diag([1e3, 1e3, 1e3, 1])
         scaled = mm @ T @ np.linalg.inv(mm)
@@ -134,23 +137,40 @@ def test_one_step_against_the_stacked_system_of_the_paper(rows, kind):
     np.testing.assert_allclose(solution.T_world_i[1:], expected, atol=2e-6)
 
 
-def test_ten_percent_of_outliers_hardly_matter():
-    """The median over seeds is near that of the oracle that knows the inliers."""
-    cases = [random_graph(N, H, 0.1, seed) for seed in range(10)]
+@pytest.mark.parametrize(
+    ("name", "outliers", "limit"), [("correntropy", 0.1, 1.15), ("annealed", 0.4, 1.05)]
+)
+def test_outliers_hardly_matter(name, outliers, limit):
+    """The median over seeds is near that of the oracle that knows the inliers.
+
+    The published width is started at the truth, the default from the motions alone.
+    """
     robust, oracle = [], []
-    for X, edges, T, bad in cases:
-        graph = single(X, edges, T)
-        start = X.astype(np.float32)
-        robust.append(errors(average(graph, METHODS["correntropy"], start), X))
+    best = METHODS["plain" if name == "correntropy" else "annealed"]
+    for seed in range(10):
+        X, edges, T, bad = random_graph(N, H, outliers, seed)
+        start = None if name == "annealed" else X
+        found = average(single(X, edges, T), METHODS[name], start)
+        assert found.status == Status.CONVERGED
+        robust.append(errors(found, X))
         kept = single(X, edges, T, mask=~bad)
-        oracle.append(errors(average(kept, METHODS["plain"], start), X))
+        oracle.append(errors(average(kept, best, start), X))
     ratio = np.median(robust, axis=0) / np.median(oracle, axis=0)
-    assert (ratio < 1.15).all(), ratio
+    assert (ratio < limit).all(), ratio
+
+
+def test_kernel_width_is_three_deviations_of_the_noise():
+    found = []
+    for seed in range(5):
+        X, edges, T, _ = random_graph(N, H, 0.3, seed)
+        found.append(average(single(X, edges, T), METHODS["annealed"]).kernel_width)
+    width = np.median(found, axis=0)
+    np.testing.assert_allclose(width, [3 * 0.005, 3 * np.deg2rad(0.5)], rtol=0.2)
 
 
 def test_edge_weights_name_the_outliers():
-    X, edges, T, bad = random_graph(N, H, 0.1, 3)
-    solution = average(single(X, edges, T), METHODS["correntropy"], X)
+    X, edges, T, bad = random_graph(N, H, 0.4, 3)
+    solution = average(single(X, edges, T), METHODS["annealed"])
     weight = np.asarray(solution.edge_weight)
     assert weight[bad].max() < weight[~bad].min()
     assert "trusted" in repr(solution)
@@ -160,7 +180,7 @@ def test_batches_agree_with_single_graphs():
     cases = [random_graph(N, H, 0.1, seed) for seed in range(3)]
     graphs = [single(X, edges, T) for X, edges, T, _ in cases]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *graphs)
-    for name in ("plain", "correntropy"):
+    for name in ("plain", "annealed"):
         many = jax.vmap(lambda g: average(g, METHODS[name]))(batch)  # noqa: B023
         assert many.status.shape == (3,)
         for lane, graph in enumerate(graphs):
@@ -168,13 +188,16 @@ def test_batches_agree_with_single_graphs():
             np.testing.assert_allclose(many.T_world_i[lane], one.T_world_i, atol=1e-4)
 
 
-def test_gradients_agree_with_differences():
+@pytest.mark.parametrize("kind", ["averaging", "gauss-newton"])
+def test_gradients_agree_with_differences(kind):
+    """At a fixed kernel width, since widths are cut from the gradient."""
     X, edges, T, _ = random_graph(N, H, 0.05, 4)
     rng = np.random.default_rng(0)
+    rows = scaled_rows("sqrt")
     with jax.enable_x64(True):
         graph = PoseGraph.from_edges(edges, T, weight=rng.uniform(0.5, 1.5, H))
         probe = rng.normal(size=(N, 4, 4))
-        init, width = jnp.asarray(X), jnp.array([0.05, 0.05])
+        init = jnp.asarray(X)
 
         @jax.jit
         def value(T, weight):
@@ -182,12 +205,17 @@ def test_gradients_agree_with_differences():
             end = iterate(
                 g,
                 init,
-                lambda g, T: width,
+                jnp.array([0.05, 0.1]),
+                lambda g, T, width: width,
                 gaussian_trust,
-                scaled_rows("sqrt"),
+                averaging_step(rows) if kind == "averaging" else gauss_newton_step,
                 max_steps=200,
-                tolerance=jnp.asarray(1e-12),
+                tolerance=1e-13,
             )
+            if kind == "averaging":
+                end = averaging_gradients(g, end, gaussian_trust, rows)
+            else:
+                end = gauss_newton_gradients(g, end, gaussian_trust)
             return jnp.sum(probe * end.T_world_i)
 
         by_T, by_weight = jax.grad(value, argnums=(0, 1))(graph.T_i_j, graph.weight)
@@ -209,7 +237,7 @@ def test_gradients_are_finite_without_noise_and_follow_the_gauge():
     def slope(args):
         T, weight, init = args
         graph = PoseGraph.from_edges(edges, T, N, weight)
-        return jnp.sum(average(graph, METHODS["correntropy"], init=init).T_world_i ** 2)
+        return jnp.sum(average(graph, METHODS["annealed"], init=init).T_world_i ** 2)
 
     by = slope((jnp.asarray(T, jnp.float32), jnp.ones(H), start))
     assert all(np.isfinite(x).all() for x in by)
@@ -222,7 +250,7 @@ def test_parts_that_hang_apart_are_told():
     X, edges, T, _ = random_graph(N, H, 0.0, 5, noise=0.0)
     cut = (edges < 8).all(axis=1) | (edges >= 8).all(axis=1)
     graph = single(X, edges, T, mask=cut)
-    for name in ("tree", "paths", "plain", "correntropy"):
+    for name in ("tree", "paths", "plain", "annealed"):
         solution = average(graph, METHODS[name])
         assert solution.status == Status.DISCONNECTED
         np.testing.assert_array_equal(solution.placed, np.arange(N) < 8)
@@ -257,7 +285,7 @@ def test_numbers_that_are_not_finite_cost_their_edge_alone():
 
 def test_one_pose_no_edges_and_running_out_of_steps():
     empty = PoseGraph.from_edges([], np.zeros((0, 4, 4), np.float32), num_poses=1)
-    for name in ("tree", "paths", "plain", "correntropy"):
+    for name in ("tree", "paths", "plain", "annealed"):
         solution = average(empty, METHODS[name])
         assert solution.status == Status.CONVERGED
         np.testing.assert_array_equal(solution.T_world_i[0], np.eye(4))
@@ -293,7 +321,7 @@ def test_settings_do_not_recompile_and_solutions_are_arrays():
 def test_single_precision_stays_single_with_double_enabled():
     X, edges, T, _ = random_graph(N, H, 0.1, 0)
     with jax.enable_x64(True):
-        for name in ("tree", "plain", "correntropy"):
+        for name in ("tree", "plain", "annealed"):
             solution = average(single(X, edges, T), METHODS[name])
             floats = [x.dtype for x in jax.tree.leaves(solution) if x.dtype.kind == "f"]
             assert set(floats) == {np.dtype(np.float32)}

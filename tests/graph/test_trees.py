@@ -85,7 +85,7 @@ def test_paths_are_those_of_least_variance():
     T[:, 0, 3] = [1, 1, 10]
     edges = jnp.array([[0, 1], [1, 2], [0, 2]], jnp.int32)
     for direct, expected in ((3.0, 2.0), (1.5, 10.0)):
-        weight = np.float32([1, 1, 1 / direct])
+        weight = np.array([1, 1, 1 / direct], np.float32)
         poses, _ = trees.shortest_path_poses(
             edges, jnp.asarray(T), jnp.asarray(weight), 3
         )

@@ -1,0 +1,119 @@
+"""Gauss-Newton steps on the weighted tangent errors, all k v unknowns together.
+
+Motion averaging solves for rotations and translations side by side, which is fast and
+nearly right; this finishes the job with each part at its own precision.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg.averaging.implicit import differentiable
+from jaxreg.averaging.iterate import Iterated, TrustOf
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import PoseGraph, product
+
+
+def normal_equations(
+    graph: PoseGraph,
+    T_world_i: Float[Array, "v D D"],
+    precision: Float[Array, "e k k"],
+) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """J' W J and J' W r of the errors log(inv(T_i_j) inv(T_world_i) T_world_j).
+
+    Unknowns are right tangents, T_world_i exp(x_i). To first order in the residual
+    the error changes by x_j - Ad(inv(T_world_j) T_world_i) x_i. Rows and columns of
+    frame 0, and of frames that nothing holds, are those of the identity.
+    """
+    num, k = graph.num_poses, precision.shape[-1]
+    i, j = graph.edges[:, 0], graph.edges[:, 1]
+    J = _jacobian(graph, T_world_i)
+    WJ = product(precision, J)
+    JWJ = product(jnp.swapaxes(J, -1, -2), WJ)
+    H = jnp.zeros((num, num, k, k), J.dtype)
+    H = H.at[i, i].add(JWJ).at[j, j].add(precision)
+    H = H.at[j, i].add(WJ).at[i, j].add(jnp.swapaxes(WJ, -1, -2))
+    g = forces(graph, T_world_i, precision)
+    free = jnp.trace(H[jnp.arange(num), jnp.arange(num)], axis1=-2, axis2=-1) > 0
+    free = free.at[0].set(False)
+    both = free[:, None, None, None] & free[None, :, None, None]
+    H = jnp.where(both, H, 0).transpose(0, 2, 1, 3).reshape(num * k, num * k)
+    held = jnp.repeat(~free, k).astype(H.dtype)
+    return H + jnp.diag(held), jnp.where(free[:, None], g, 0).reshape(-1)
+
+
+def forces(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"], precision: Float[Array, "e k k"]
+) -> Float[Array, "v k"]:
+    """J' W r, by frame."""
+    i, j = graph.edges[:, 0], graph.edges[:, 1]
+    error = graph.tangent_errors(T_world_i)
+    J = _jacobian(graph, T_world_i)
+    We = jnp.sum(precision * error[:, None, :], axis=-1)
+    g = jnp.zeros((graph.num_poses, error.shape[-1]), error.dtype).at[j].add(We)
+    return g.at[i].add(jnp.sum(J * We[:, :, None], axis=-2))
+
+
+def _jacobian(graph: PoseGraph, T_world_i: Array) -> Array:
+    """The derivative of the error with respect to x_i; that to x_j is the identity."""
+    i, j = graph.edges[:, 0], graph.edges[:, 1]
+    return -lie.adjoint(product(lie.inverse(T_world_i)[j], T_world_i[i]))
+
+
+def precisions(
+    graph: PoseGraph, trust: Float[Array, " e"], width: Float[Array, "2"]
+) -> Float[Array, "e k k"]:
+    """Weight times trust times the information of each edge.
+
+    Without information, every edge has that of noise in proportion to the widths,
+    with 1 for rotations.
+    """
+    w = (graph.weight * trust)[:, None, None]
+    if graph.information is not None:
+        return w * graph.information
+    d, k = graph.dim, lie.tangent_dim(graph.dim)
+    shift = jnp.full((d,), (width[1] / width[0]) ** 2)
+    return w * jnp.diag(jnp.concatenate([shift, jnp.ones((k - d,), shift.dtype)]))
+
+
+def gauss_newton_step(
+    graph: PoseGraph,
+    T_world_i: Float[Array, "v D D"],
+    trust: Float[Array, " e"],
+    width: Float[Array, "2"],
+) -> Float[Array, "v D D"]:
+    """The poses after one step, from a dense Cholesky factor of the normal equations.
+
+    The system is scaled to a unit diagonal, which makes it safe in float32.
+    """
+    precision = precisions(graph, trust, width)
+    H, g = normal_equations(graph, T_world_i, precision)
+    inverse_root = jax.lax.rsqrt(jnp.diagonal(H))
+    scaled = H * inverse_root[:, None] * inverse_root[None, :]
+    ridge = 100 * jnp.finfo(H.dtype).eps
+    factor = jnp.linalg.cholesky(scaled + ridge * jnp.eye(len(g), dtype=H.dtype))
+    y = jax.lax.linalg.triangular_solve(
+        factor, (inverse_root * g)[:, None], left_side=True, lower=True
+    )
+    x = jax.lax.linalg.triangular_solve(
+        factor, y, left_side=True, lower=True, transpose_a=True
+    )
+    tangent = -(inverse_root * x[:, 0]).reshape(graph.num_poses, -1)
+    return product(T_world_i, lie.exp(tangent))
+
+
+def gauss_newton_gradients(
+    graph: PoseGraph, end: Iterated, trust_of: TrustOf
+) -> Iterated:
+    """The same result with derivatives by the balance of forces at the minimum."""
+    held = jax.lax.stop_gradient(graph.weight * end.trust)
+    top = jnp.max(held)
+    held = held / jnp.where(top > 0, top, 1)
+
+    def imbalance(g: PoseGraph, T: Array) -> Array:
+        trust = trust_of(g, T, end.width)
+        W = precisions(g, trust, end.width)
+        return forces(g, T, W)
+
+    T = differentiable(graph, end.T_world_i, imbalance, held)
+    return end._replace(T_world_i=T, trust=trust_of(graph, T, end.width))

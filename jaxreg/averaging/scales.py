@@ -1,0 +1,71 @@
+"""Kernel widths that follow the data: rotation and translation at their own scales."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg.averaging.base import length_scale, masked_quantile
+from jaxreg.graph.pose_graph import PoseGraph
+
+
+# The kernel is three standard deviations of the noise wide: right edges lose little
+# (the mean is 2 % worse than with the inliers known), wrong ones most.
+_DEVIATIONS = 3.0
+_NARROWEST_STEP = 0.5
+_WIDEST_START = 0.3
+
+
+def gaussian_trust(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"], width: Float[Array, "2"]
+) -> Float[Array, " e"]:
+    """G_sigma of the residual of each edge (Eq. 12); widths are (length, angle)."""
+    rotation, translation = graph.differences(T_world_i)
+    sq = translation / width[0] ** 2 + rotation / (2 * width[1] ** 2)
+    return jnp.exp(-sq / 2)
+
+
+def first_width(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+) -> Float[Array, "2"]:
+    """A width that sees the right edges from the start.
+
+    Twice the lower quartile of the residuals that the start leaves (the edges of its
+    tree leave none), for starts that drift, and at least 0.3 rad and length scales.
+    """
+    scale = length_scale(graph)
+    rotation, translation = graph.differences(T_world_i)
+    sq = rotation / 2 + translation / scale**2
+    eps = 1e-4 if sq.dtype == jnp.float32 else 1e-8
+    open_edges = (graph.weight > 0) & (sq > eps**2)
+    low = jnp.sqrt(masked_quantile(sq, open_edges, 0.25))
+    width = jnp.maximum(2 * low, _WIDEST_START)
+    return jnp.stack([width * scale, width])
+
+
+def annealed_width(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"], width: Float[Array, "2"]
+) -> Float[Array, "2"]:
+    """The next width: three deviations of the edges inside the present one.
+
+    Never wider than before and at most halved. The weighted mean square v of Gaussian
+    noise of variance s^2 under a Gaussian kernel of width w is 1 / (1/s^2 + 1/w^2),
+    which is solved for s^2; s^2 is enlarged for the unknowns that the poses take up.
+    """
+    d = graph.dim
+    rotation, translation = graph.differences(T_world_i)
+    trust = gaussian_trust(graph, T_world_i, width)
+    w = graph.weight * trust
+    total = jnp.maximum(jnp.sum(w), jnp.finfo(w.dtype).tiny)
+    dof = d * (d - 1) / 2
+    v = jnp.stack([jnp.sum(w * translation) / d, jnp.sum(w * rotation) / (2 * dof)])
+    v = v / total
+    ratio = jnp.minimum(v / width**2, 0.9)
+    count = jnp.sum(jnp.where(graph.weight > 0, trust, 0))
+    spare = jnp.maximum(count - (graph.num_poses - 1), 0.25 * count)
+    variance = ratio / (1 - ratio) * width**2 * count / jnp.maximum(spare, 1e-3)
+    floor = (
+        64
+        * jnp.finfo(w.dtype).eps
+        * jnp.stack([length_scale(graph), jnp.ones_like(total)])
+    )
+    target = jnp.maximum(_DEVIATIONS * jnp.sqrt(variance), floor)
+    return jnp.clip(target, _NARROWEST_STEP * width, width)
