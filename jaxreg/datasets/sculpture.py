@@ -50,7 +50,7 @@ def sculpture_distance(points: np.ndarray) -> np.ndarray:
     Returns:
         `(n,)` in metres, of the same dtype.
     """
-    parts = [_limb(points, row) for row in _LIMBS.astype(points.dtype)]
+    parts = [*_limbs(points, _LIMBS.astype(points.dtype))]
     parts += [_ring(points, row) for row in _RINGS.astype(points.dtype)]
     total = parts[0]
     for part in parts[1:]:
@@ -188,10 +188,16 @@ def _gradient(
     return np.sum(values, axis=0) / (4 * step)
 
 
-def _limb(x: np.ndarray, row: np.ndarray) -> np.ndarray:
-    a, b, r_a, r_b = row[:3], row[3:6], row[6], row[7]
-    along = np.clip((x - a) @ ((b - a) / np.sum((b - a) ** 2)), 0, 1)
-    return _norm(x - a - along[:, None] * (b - a)) - (r_a + along * (r_b - r_a))
+def _limbs(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Distance to every limb, `(limbs, n)`; products of matrices, for speed."""
+    a, ab = rows[:, :3], rows[:, 3:6] - rows[:, :3]
+    length_sq = np.einsum("ij,ij->i", ab, ab)[:, None]
+    from_a_sq = np.einsum("ij,ij->i", x, x) - 2 * (a @ x.T)
+    from_a_sq += np.einsum("ij,ij->i", a, a)[:, None]
+    dot = ab @ x.T - np.einsum("ij,ij->i", ab, a)[:, None]
+    along = np.clip(dot / length_sq, 0, 1)
+    gap_sq = np.maximum(from_a_sq + along * (along * length_sq - 2 * dot), 0)
+    return np.sqrt(gap_sq) - (rows[:, 6:7] + along * (rows[:, 7:8] - rows[:, 6:7]))
 
 
 def _ring(x: np.ndarray, row: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ _LIGHT = np.array([-0.45, 0.55, 0.70]) / np.linalg.norm([-0.45, 0.55, 0.70])
 
 
 def render_points(
-    points: np.ndarray, group: np.ndarray, colors: np.ndarray, size: int = 640
+    points: np.ndarray, group: np.ndarray, colors: np.ndarray, size: int = 560
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
     """Draws points seen along -z (x to the right, y up), nearer ones in front.
 
@@ -134,8 +134,10 @@ def _shade(
     depth: np.ndarray, covered: np.ndarray, pixel: float, blur: int
 ) -> np.ndarray:
     """Brightness from the slope of the blurred depth."""
-    weight = _box(covered.astype(float), blur)
-    smooth = _box(np.where(covered, depth, 0), blur) / np.maximum(weight, 1e-12)
+    weight = _box(covered.astype(np.float32), blur)
+    smooth = _box(np.where(covered, depth, 0).astype(np.float32), blur) / np.maximum(
+        weight, 1e-12
+    )
     slope_y, slope_x = np.gradient(smooth, pixel)
     slope = np.clip(np.stack([-slope_x, -slope_y]), -3, 3)
     cosine = (_LIGHT[0] * slope[0] + _LIGHT[1] * slope[1] + _LIGHT[2]) / np.sqrt(
@@ -149,7 +151,7 @@ def _box(image: np.ndarray, width: int) -> np.ndarray:
     half = width // 2
     for axis in (0, 1, 0, 1):
         pad = [(half + 1, half) if a == axis else (0, 0) for a in (0, 1)]
-        total = np.cumsum(np.pad(image, pad, mode="edge"), axis=axis)
+        total = np.cumsum(np.pad(image, pad, mode="edge"), axis=axis, dtype=float)
         n = image.shape[axis]
         image = (
             np.take(total, range(2 * half + 1, n + 2 * half + 1), axis)
