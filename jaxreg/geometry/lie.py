@@ -62,6 +62,21 @@ def log(T: Motions) -> Float[Array, "*b k"]:
 
 
 @_behind
+def rotation_exp(w: Float[Array, "*b r"]) -> Float[Array, "*b d d"]:
+    """The rotation of a rotation vector, `(..., 1)` in 2D or `(..., 3)` in 3D."""
+    if w.shape[-1] == 1:
+        return jaxlie.SO2.exp(w).as_matrix()
+    return jaxlie.SO3.exp(w).as_matrix()
+
+
+@_behind
+def rotation_log(R: Float[Array, "*b d d"]) -> Float[Array, "*b r"]:
+    """The rotation vector of a rotation, `(..., 1)` in 2D or `(..., 3)` in 3D."""
+    group = jaxlie.SO2 if R.shape[-1] == 2 else jaxlie.SO3
+    return group.from_matrix(R).log()
+
+
+@_behind
 def adjoint(T: Motions) -> Float[Array, "*b k k"]:
     """Ad(T): `T exp(v) inv(T) = exp(Ad(T) v)`."""
     group = jaxlie.SE2 if T.shape[-1] == 3 else jaxlie.SE3

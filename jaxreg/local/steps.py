@@ -87,9 +87,8 @@ class GaussNewton(AbstractStep):
 def turn_and_shift(T_target_source: Motion, tangent: Float[Array, " k"]) -> Motion:
     """Applies (v, w) about the origin of the source: R -> exp(w) R, t -> t + v."""
     d = T_target_source.shape[-1] - 1
-    turn = lie.exp(tangent.at[:d].set(0))
     return lie.compose(
-        lie.rotation(turn) @ lie.rotation(T_target_source),
+        lie.rotation_exp(tangent[d:]) @ lie.rotation(T_target_source),
         lie.translation(T_target_source) + tangent[:d],
     )
 
@@ -98,8 +97,6 @@ def decoupled_error(
     T_after: Float[Array, "D D"], T_before: Float[Array, "D D"]
 ) -> Float[Array, " k"]:
     """(v, w) with `turn_and_shift(T_before, (v, w)) = T_after` (PF paper, Eq. 6)."""
-    turn = lie.rotation(T_after) @ lie.rotation(T_before).T
-    d = turn.shape[0]
-    w = lie.log(lie.compose(turn, jnp.zeros(d, dtype=turn.dtype)))[d:]
+    w = lie.rotation_log(lie.rotation(T_after) @ lie.rotation(T_before).T)
     v = lie.translation(T_after) - lie.translation(T_before)
     return jnp.concatenate([v, w])

@@ -55,7 +55,10 @@ class ReconstructionSolution(eqx.Module):
         graph: every pair that was registered, `T_i_j` in the input's frames and unit,
             prior weight the overlap where it is trusted and else 0.
         overlap: `(e,)` lesser share of either scan that lies on the other.
-        edge_weight: `(e,)` trust after averaging, 0 to 1.
+        edge_weight: `(e,)` trust, 0 to 1: how well the pair's own motion agrees with
+            the final poses, by a Gaussian of the displacement of the scan whose width
+            is the sample spacing; 0 where the overlap is too small or a scan is not
+            placed.
         inlier_rmse: `(e,)` distance of that share, in the unit of the input.
         num_dropped: `(v,)` rows that were not finite.
     """
@@ -97,8 +100,8 @@ def reconstruct(
         scans: a list of `(n_i, d)` point sets, or a padded array `(v, n, d)`.
         key: a `jax.random.key`; the same key gives the same answer.
         method: the search between pairs, `ParticleFilter()` by default.
-        averaging: how relative motions become poses; None for the default of
-            `average`.
+        averaging: how relative motions become poses; None for the MCC paper's
+            `Correntropy` from the spanning tree of largest overlap.
         mask: `(v, n)` True for valid points, for a padded array only.
         progress: called as `progress(stage, done, total)`; not under `jit`.
 
@@ -253,10 +256,30 @@ def _finish(
         placed=placed,
         graph=graph,
         overlap=motions.overlap,
-        edge_weight=placement.edge_weight,
+        edge_weight=_trust(scans, pairs, motions, T_centred, placed, weight),
         inlier_rmse=motions.inlier_rmse * scans.radius,
         num_dropped=scans.num_dropped,
     )
+
+
+def _trust(
+    scans: PreparedScans,
+    pairs: Int[Array, "e 2"],
+    motions: RelativeMotions,
+    T_world_i: Float[Array, "v D D"],
+    placed: Bool[Array, " v"],
+    weight: Float[Array, " e"],
+) -> Float[Array, " e"]:
+    """Agreement of the pairs' motions with the poses; the centred radius is one."""
+    i, j = pairs[:, 0], pairs[:, 1]
+    T_error = lie.inverse(T_world_i[i]) @ T_world_i[j] @ lie.inverse(motions.T_i_j)
+    turn = lie.rotation_angle(lie.rotation(T_error))
+    centre = lie.translation(lie.inverse(T_world_i[i]) @ T_world_i[j])
+    shift = centre - lie.translation(motions.T_i_j)
+    sq = turn**2 + jnp.sum(shift**2, axis=-1)
+    spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
+    trust = jnp.exp(-sq / (2 * jnp.maximum(spacing, 1e-6) ** 2))
+    return jnp.where((weight > 0) & placed[i] & placed[j], trust, 0)
 
 
 def _in_first_frame(

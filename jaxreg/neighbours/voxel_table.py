@@ -44,7 +44,7 @@ class VoxelTable(AbstractIndex):
         points: Points,
         mask: Mask | None = None,
         *,
-        resolution: int = 64,
+        resolution: int | None = None,
         margin: float = 0.1,
     ) -> "VoxelTable":
         """Fills the table.
@@ -52,10 +52,13 @@ class VoxelTable(AbstractIndex):
         Args:
             points: `(m, d)` target points.
             mask: `(m,)` True for valid points.
-            resolution: cells along each axis; memory is resolution^d integers.
+            resolution: cells along each axis, 512 in 2D and 64 in 3D by default; the
+                table holds resolution^d integers, 1 MB in either case.
             margin: the grid reaches beyond the longest side of the bounding box by
                 this share of it on every side.
         """
+        if resolution is None:
+            resolution = 512 if points.shape[1] == 2 else 64
         if mask is None:
             mask = jnp.ones(points.shape[:1], dtype=bool)
         inf = jnp.asarray(jnp.inf, points.dtype)

@@ -110,14 +110,23 @@ class ParticleFilter(AbstractRegistrar):
             "inner_steps",
             "num_points",
             "num_modes",
+            "batch_size",
         ):
             if getattr(self, name) < 1:
                 raise ValueError(
                     f"ParticleFilter: {name} must be at least 1, found "
                     f"{getattr(self, name)}."
                 )
-        if self.num_particles < 2:
-            raise ValueError("ParticleFilter: num_particles must be at least 2.")
+        if not 2 <= self.num_particles <= self.num_prior:
+            raise ValueError(
+                "ParticleFilter: num_particles must be from 2 to num_prior = "
+                f"{self.num_prior}, found {self.num_particles}."
+            )
+        if self.num_prior % self.batch_size:
+            raise ValueError(
+                f"ParticleFilter: batch_size {self.batch_size} must divide num_prior "
+                f"= {self.num_prior}."
+            )
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
         """Thinned to `max_points`, with normals."""
@@ -193,7 +202,7 @@ class ParticleFilter(AbstractRegistrar):
     ) -> tuple[Particles, Float[Array, " p"]]:
         """The filter; returns measured particles and their weights."""
         n, dtype = self.num_particles, problem.source.dtype
-        key_prior, key_first, key_loop = jax.random.split(key, 3)
+        key_prior, key_loop = jax.random.split(key)
         if init is None:
             d = problem.source.shape[0]
             T = prior.uniform(
@@ -207,39 +216,46 @@ class ParticleFilter(AbstractRegistrar):
         share = jnp.linspace(0, 1, self.num_times + 1, dtype=dtype)
         widths = self.width_start * (self.width_end / self.width_start) ** share
 
-        def measured(T: Array, width: Array, num_steps: int) -> Particles:
-            return measure(
-                problem,
-                optimiser,
-                T,
-                width,
-                num_steps=num_steps,
-                batch_size=self.batch_size,
-            )
-
-        drawn = measured(T, widths[0], self.prior_steps)
+        # At t = 0 the whole prior is measured, later the first n rows; one loop with a
+        # varying number of rows compiles the measurement once.
+        first = jnp.arange(self.num_times + 1) == 0
+        num_rows = jnp.where(first, self.num_prior, n)
+        num_steps = jnp.where(first, self.prior_steps, self.inner_steps)
         # The prior's motion error spans a descent from nowhere in particular.
-        drawn = eqx.tree_at(
-            lambda p: p.motion_error, drawn, drawn.motion_error / self.prior_steps
-        )
-        weight = tempered_weights(drawn.energy, jnp.asarray(n, dtype))
-        particles = drawn.rows(systematic(key_first, weight, n))
+        alpha = jnp.where(first, 0, self.diffusion)
+        alpha = alpha.at[1].divide(self.prior_steps).astype(dtype)
+        size = jnp.where(first, n, self.sample_share * n).astype(dtype)
 
         def step(
-            carry: tuple[Particles, Array], at: tuple[Array, Array]
+            carry: tuple[Particles, Array], at: tuple[Array, ...]
         ) -> tuple[tuple[Particles, Array], None]:
             # Resampling opens a step, so the last particles keep their weights.
             particles, weight = carry
-            key_resample, key_diffuse = jax.random.split(at[0])
-            particles = particles.rows(systematic(key_resample, weight, n))
-            T_predicted = diffuse(key_diffuse, particles, self.diffusion)
-            particles = measured(T_predicted, at[1], self.inner_steps)
-            weight = tempered_weights(particles.energy, self.sample_share * n)
-            return (particles, weight), None
+            key, width, rows, steps, alpha, size = at
+            key_resample, key_diffuse = jax.random.split(key)
+            ancestors = systematic(key_resample, weight, rows)
+            particles = particles.rows(ancestors)
+            T_predicted = diffuse(key_diffuse, particles, alpha)
+            particles = measure(
+                problem,
+                optimiser,
+                T_predicted,
+                width,
+                num_rows=rows,
+                num_steps=steps,
+                batch_size=self.batch_size,
+            )
+            return (particles, tempered_weights(particles.energy, size)), None
 
-        start = (particles, jnp.full(n, 1 / n, dtype))
-        keys = jax.random.split(key_loop, self.num_times)
-        return lax.scan(step, start, (keys, widths[1:]))[0]
+        zero = jnp.zeros((self.num_prior, lie.tangent_dim(T.shape[-1] - 1)), dtype)
+        start = (
+            Particles(T, zero, zero[:, 0]),
+            jnp.full(self.num_prior, 1 / self.num_prior, dtype),
+        )
+        keys = jax.random.split(key_loop, self.num_times + 1)
+        schedule = (keys, widths, num_rows, num_steps, alpha, size)
+        particles, weight = lax.scan(step, start, schedule)[0]
+        return particles.rows(jnp.arange(n)), weight[:n]
 
     def _refine(
         self, problem: Problem, T: Float[Array, "q D D"], spacing: Scalar

@@ -43,15 +43,22 @@ def tempered_weights(
     return weights(lax.fori_loop(0, 24, halve, (span * 1e-4, span * 1e3))[1])
 
 
-def systematic(key: Key, weight: Float[Array, " p"], num: int) -> Int[Array, " q"]:
+def systematic(
+    key: Key, weight: Float[Array, " p"], num: Int[Array, ""] | int
+) -> Int[Array, " p"]:
     """Ancestors drawn by systematic resampling: one uniform number for all.
 
     The expected number of copies of i is num * weight_i, the actual one is that
     rounded up or down.
+
+    Args:
+        key: randomness.
+        weight: `(p,)`, any scale.
+        num: how many to draw, at most p; rows of the result beyond it mean nothing.
     """
     cumulative = jnp.cumsum(weight)
     cumulative = cumulative / cumulative[-1]
     start = jax.random.uniform(key, (), weight.dtype)
-    at = (jnp.arange(num, dtype=weight.dtype) + start) / num
+    at = (jnp.arange(weight.shape[0], dtype=weight.dtype) + start) / num
     rows = jnp.searchsorted(cumulative, at, side="right")
     return jnp.minimum(rows, weight.shape[0] - 1).astype(jnp.int32)

@@ -42,9 +42,12 @@ def test_measurement_descends_and_reports_what_it_moved():
         [jnp.asarray(motion(s, 3, angle=0.2, shift=0.05)) for s in range(8)]
     ).astype(jnp.float32)
     width = jnp.asarray(0.2)
-    out = measure(problem, optimiser, start, width, num_steps=5, batch_size=4)
+    out = measure(
+        problem, optimiser, start, width, num_rows=6, num_steps=5, batch_size=2
+    )
     before = jax.vmap(lambda T: energy(problem, T, width))(start)
-    assert np.all(np.asarray(out.energy) < np.asarray(before))
+    assert np.all(np.asarray(out.energy)[:6] < np.asarray(before)[:6])
+    np.testing.assert_array_equal(out.energy[6:], np.inf)
     moved = jax.vmap(decoupled_error)(out.T_target_source, start)
     np.testing.assert_allclose(out.motion_error, moved, atol=1e-6)
 
