@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.checks import is_concrete
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, StatusArray
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, is_concrete
+from jaxreg.graph.pose_graph import PoseGraph
 
 
 class AveragingSolution(eqx.Module):

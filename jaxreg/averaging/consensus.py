@@ -59,9 +59,16 @@ class CycleConsensus(AbstractAverager):
         graph = jax.lax.stop_gradient(graph)
         scale, odds = length_scale(graph), edge_log_odds(graph)
         first = _chain(graph, odds)
+        score = agreement(graph, first, scale)
+        # Prior weights are evidence too: the heaviest tree is a hypothesis of its own.
+        tree = trees.maximum_spanning_tree(
+            graph.edges, graph.T_i_j, graph.weight, graph.num_poses
+        ).T_world_i
+        tree_score = agreement(graph, tree, scale)
+        first = jnp.where(tree_score > score, tree, first)
         start = _Search(
             T=first,
-            score=agreement(graph, first, scale),
+            score=jnp.maximum(score, tree_score),
             settled=_is_settled(graph, odds, first, scale),
             round=jnp.asarray(0, jnp.int32),
             key=jax.random.key(0) if key is None else key,

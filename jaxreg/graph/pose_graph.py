@@ -6,10 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.checks import as_float_array, check_mask
+from jaxreg._core.checks import as_float_array, check_mask, is_concrete
 from jaxreg.geometry import lie
 
 
@@ -218,11 +217,6 @@ def chordal_weights(
         inverse = jnp.linalg.inv(info[:, d:, d:])
         kappa = 1.5 / jnp.trace(inverse, axis1=-2, axis2=-1)
     return graph.weight * kappa, graph.weight * tau
-
-
-def is_concrete(x: Any) -> bool:
-    """True where the values can be read, False while tracing."""
-    return not eqx.is_array(x) or not isinstance(x, Tracer)
 
 
 def _check_ids(edges: object, num: int) -> Int[Array, "e 2"]:
