@@ -21,7 +21,7 @@ from jaxreg.averaging.base import (
     solution,
     weighted_mean,
 )
-from jaxreg.averaging.consensus import CycleConsensus
+from jaxreg.averaging.consensus import CycleConsensus, agreement
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, gauss_newton_step
 from jaxreg.averaging.iterate import (
     Iterated,
@@ -30,7 +30,7 @@ from jaxreg.averaging.iterate import (
     iterate,
 )
 from jaxreg.averaging.laplacian import DENSE_LIMIT
-from jaxreg.averaging.plain import check_rows, scaled_rows
+from jaxreg.averaging.plain import RowsOf, check_rows, iterate_plain, scaled_rows
 from jaxreg.averaging.scales import annealed_width, first_width, gaussian_trust
 from jaxreg.averaging.tree import start
 from jaxreg.graph.pose_graph import PoseGraph
@@ -122,6 +122,7 @@ class Correntropy(AbstractAverager):
     def _annealed(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
         rows = scaled_rows(self.rows)
         finish = graph.num_poses <= DENSE_LIMIT
+        T_start = _better_start(graph, T_start, rows)
         end = iterate(
             graph,
             T_start,
@@ -147,3 +148,18 @@ class Correntropy(AbstractAverager):
         )
         last = last._replace(num_steps=end.num_steps + last.num_steps)
         return gauss_newton_gradients(graph, last, gaussian_trust)
+
+
+def _better_start(
+    graph: PoseGraph, T_start: Float[Array, "v D D"], rows: RowsOf
+) -> Float[Array, "v D D"]:
+    """The start, or what a few plain steps make of it if more edges agree with that.
+
+    A chain of good edges drifts: its loop closures then look wrong, and a redescending
+    kernel would drop them. Plain averaging spreads the drift; with wrong edges about,
+    it agrees with few, and the start stands.
+    """
+    plain = iterate_plain(graph, T_start, rows, max_steps=5, tolerance=1e-2)
+    scale = length_scale(graph)
+    better = agreement(graph, plain.T_world_i, scale) > agreement(graph, T_start, scale)
+    return jnp.where(better, plain.T_world_i, T_start)

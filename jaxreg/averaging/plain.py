@@ -14,6 +14,7 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
 from jaxreg.averaging.iterate import (
+    Iterated,
     RowsOf,
     averaging_gradients,
     averaging_step,
@@ -113,23 +114,37 @@ def _least_squares(
     max_steps: int,
     tolerance: Array | float,
 ) -> AveragingSolution:
+    end = iterate_plain(graph, T_start, rows, max_steps=max_steps, tolerance=tolerance)
+    end = averaging_gradients(graph, end, _full_trust, rows)
+    return solution(
+        graph, end.T_world_i, converged=end.converged, num_steps=end.num_steps
+    )
+
+
+def iterate_plain(
+    graph: PoseGraph,
+    T_start: Float[Array, "v D D"],
+    rows: RowsOf,
+    *,
+    max_steps: int,
+    tolerance: Array | float,
+) -> Iterated:
+    """Averaging in which every edge is trusted; no gradients."""
+
     def same_width(g: PoseGraph, T: Array, width: Array) -> Array:
         return width
 
-    def full_trust(g: PoseGraph, T: Array, width: Array) -> Array:
-        return jnp.ones_like(g.weight)
-
-    end = iterate(
+    return iterate(
         graph,
         T_start,
         jnp.full((2,), jnp.inf, T_start.dtype),
         same_width,
-        full_trust,
+        _full_trust,
         averaging_step(rows),
         max_steps=max_steps,
         tolerance=tolerance,
     )
-    end = averaging_gradients(graph, end, full_trust, rows)
-    return solution(
-        graph, end.T_world_i, converged=end.converged, num_steps=end.num_steps
-    )
+
+
+def _full_trust(graph: PoseGraph, T: Array, width: Array) -> Array:
+    return jnp.ones_like(graph.weight)
