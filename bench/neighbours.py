@@ -1,0 +1,124 @@
+"""Closest-point queries a second on one core, beside the k-d trees that users have.
+
+Run: taskset -c 0 python -m bench.neighbours
+
+Targets are points of the generated sculpture's scans; queries are other points of it,
+near the surface (1 mm) and after a rotation of 10 degrees. Millions of queries a
+second, best of seven after a warm-up; peers that are not installed are named. `excess`
+is the mean distance that a voxel table's answer lies beyond the closest point, in
+cells.
+"""
+
+import importlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import KDTree
+
+from jaxreg.datasets import sculpture_scans
+from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
+
+
+NUM_QUERIES = 65536
+TARGETS = (1_000, 10_000, 100_000)
+
+
+def best_time(fn: Callable[[], Any], repeats: int = 7) -> float:
+    """Least wall time of a call, after one that is not counted."""
+    jax.block_until_ready(fn())
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(fn())
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def sculpture_points(num: int, seed: int) -> np.ndarray:
+    """`(num, 3)` float32 points of the sculpture in one frame."""
+    scans, T_world_i = sculpture_scans(12, seed=seed, points_per_scan=num // 10 + 100)
+    moved = [s @ T[:3, :3].T + T[:3, 3] for s, T in zip(scans, T_world_i, strict=True)]
+    rows = np.random.default_rng(seed).permutation(sum(map(len, moved)))[:num]
+    return np.concatenate(moved)[rows].astype(np.float32)
+
+
+def queries_off(target: np.ndarray, degrees: float) -> np.ndarray:
+    """Points near the surface, turned about the vertical through the centre."""
+    rng = np.random.default_rng(1)
+    points = target[rng.integers(0, len(target), NUM_QUERIES)]
+    points = points + 1e-3 * rng.standard_normal(points.shape)
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    centre = target.mean(0)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return ((points - centre) @ turn.T + centre).astype(np.float32)
+
+
+def own_rate(index: type[AbstractIndex], target: np.ndarray, x: np.ndarray) -> float:
+    """Queries a second of an index of the package, from coordinates as rows."""
+    built = jax.jit(index.build)(jnp.asarray(target))
+    lookup = jax.jit(lambda built, columns: built.lookup(columns))
+    columns = jnp.asarray(x.T)
+    return x.shape[0] / best_time(lambda: lookup(built, columns))
+
+
+def peers(target: np.ndarray) -> dict[str, Callable[[np.ndarray], Any] | str]:
+    """Query functions of the peers, or why there is none."""
+    found: dict[str, Callable[[np.ndarray], Any] | str] = {}
+    tree = KDTree(target)
+    found["SciPy KDTree"] = lambda x: tree.query(x)
+    try:
+        fast = importlib.import_module("pykdtree.kdtree").KDTree(target)
+        found["pykdtree"] = lambda x: fast.query(x)
+    except ImportError:
+        found["pykdtree"] = "not installed"
+    try:
+        module = importlib.import_module("small_gicp")
+        own = module.KdTree(target.astype(np.float64))
+        found["small_gicp"] = lambda x: own.batch_nearest_neighbor_search(x)
+    except ImportError:
+        found["small_gicp"] = "not installed"
+    return found
+
+
+def excess_in_cells(target: np.ndarray, x: np.ndarray) -> float:
+    """Mean excess distance of the voxel table's answers."""
+    table = jax.jit(VoxelTable.build)(jnp.asarray(target))
+    found = np.sqrt(np.asarray(table.query(jnp.asarray(x)).sq_distance))
+    return float(np.mean(found - KDTree(target).query(x)[0]) / float(table.cell))
+
+
+def main() -> None:
+    """Prints a table."""
+    for num in TARGETS:
+        target = sculpture_points(num, seed=0)
+        sets = [queries_off(target, angle) for angle in (0, 10)]
+        print(f"{num} targets; M queries/s near the surface / 10 degrees off")
+        build = jax.jit(VoxelTable.build)
+        points = jnp.asarray(target)
+        seconds = best_time(lambda b=build, p=points: b(p))
+        rates = [own_rate(VoxelTable, target, x) / 1e6 for x in sets]
+        excess = excess_in_cells(target, sets[0])
+        print(
+            f"  VoxelTable    {rates[0]:8.2f} /{rates[1]:8.2f}   approximate, excess "
+            f"{excess:.2f} cells; build {1e3 * seconds:.0f} ms"
+        )
+        few = [x[:8192] for x in sets] if num > 1_000 else sets
+        if num <= 10_000:
+            rates = [own_rate(BruteForce, target, x) / 1e6 for x in few]
+            print(f"  BruteForce    {rates[0]:8.2f} /{rates[1]:8.2f}   exact")
+        for name, query in peers(target).items():
+            if isinstance(query, str):
+                print(f"  {name:13s} {query}")
+                continue
+            rates = [
+                len(x) / best_time(lambda q=query, x=x: q(x), 5) / 1e6 for x in sets
+            ]
+            print(f"  {name:13s} {rates[0]:8.2f} /{rates[1]:8.2f}   exact")
+
+
+if __name__ == "__main__":
+    main()
