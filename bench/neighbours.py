@@ -78,7 +78,9 @@ def peers(target: np.ndarray) -> dict[str, Callable[[np.ndarray], Any] | str]:
     try:
         module = importlib.import_module("small_gicp")
         own = module.KdTree(target.astype(np.float64))
-        found["small_gicp"] = lambda x: own.batch_nearest_neighbor_search(x)
+        found["small_gicp"] = lambda x: own.batch_nearest_neighbor_search(
+            np.asarray(x, np.float64), 1
+        )
     except ImportError:
         found["small_gicp"] = "not installed"
     return found

@@ -44,12 +44,25 @@ class BruteForce(AbstractIndex):
         tile = min(_QUERY_TILE, n)
         padded = jnp.pad(columns, ((0, 0), (0, -n % tile)), mode="edge")
         # Which target is closest has no gradient.
-        targets = _target_tiles(lax.stop_gradient(self.points), self.mask)
-        tiles = jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
-        row = lax.map(
-            lambda queries: _closest_over_tiles(queries, *targets),
-            lax.stop_gradient(tiles),
+        coords, penalty, first = _target_tiles(
+            lax.stop_gradient(self.points), self.mask
         )
+        queries = jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
+        queries = lax.stop_gradient(queries)
+
+        # Targets outside, queries inside: a tile of targets is sliced out once and
+        # stays in the cache; the other order runs ten times slower on CPU.
+        def step(best: tuple[Array, Array], target: tuple[Array, ...]):
+            row, sq = lax.map(lambda q: _closest_in_tile(q, *target[:2]), queries)
+            better = sq < best[1]
+            row = jnp.where(better, row + target[2], best[0])
+            return (row, jnp.where(better, sq, best[1])), None
+
+        start = (
+            jnp.zeros(queries.shape[::2], jnp.int32),
+            jnp.full(queries.shape[::2], jnp.inf, queries.dtype),
+        )
+        row = lax.scan(step, start, (coords, penalty, first))[0][0]
         return jnp.minimum(row.reshape(-1)[:n], len(self.mask) - 1)
 
 
@@ -65,25 +78,6 @@ def _target_tiles(points: Array, mask: Array) -> tuple[Array, Array, Array]:
     coords = jnp.swapaxes(coords.reshape(-1, width, points.shape[1]), 1, 2)
     first = jnp.arange(coords.shape[0], dtype=jnp.int32) * width
     return coords, penalty.reshape(-1, width), first
-
-
-def _closest_over_tiles(
-    queries: Array, coords: Array, penalty: Array, first: Array
-) -> Int[Array, " t"]:
-    def step(best: tuple[Array, Array], tile: tuple[Array, Array, Array]):
-        row, sq = _closest_in_tile(queries, tile[0], tile[1])
-        better = sq < best[1]
-        best = (
-            jnp.where(better, row + tile[2], best[0]),
-            jnp.where(better, sq, best[1]),
-        )
-        return best, None
-
-    start = (
-        jnp.zeros(queries.shape[1], jnp.int32),
-        jnp.full(queries.shape[1], jnp.inf, queries.dtype),
-    )
-    return lax.scan(step, start, (coords, penalty, first))[0][0]
 
 
 def _closest_in_tile(
