@@ -72,6 +72,7 @@ class ParticleFilter(AbstractRegistrar):
         width_start, width_end: kernel width at t = 0 and at the last step.
         translation_spread: deviation of the prior's translation between centroids.
         init_spread: deviation around `init`, in radians and radii, where it is given.
+        min_overlap: share of both clouds that must agree for a pose to be believed.
         residual, kernel: parts of the local optimiser, a Gauss-Newton step.
 
     Fails: TOO_FEW_POINTS, NON_FINITE; LOW_OVERLAP where the best pose is supported by
