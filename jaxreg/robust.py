@@ -1,46 +1,84 @@
 """Robust kernels: how much a residual counts.
 
-Each kernel is a function rho of the squared residual norm with a width in the unit of
-the residual, used through its half-quadratic weight w(r) = rho'(r) / r, so that
-iteratively reweighted least squares minimises the sum of rho. rho is scaled such that
-rho(r) -> r^2 / 2 as r -> 0, except L1, where it is |r|.
+Each kernel is a function rho of the squared residual norm r^2 with a width in the unit
+of the residual, used through its half-quadratic weight w(r) = rho'(r) / r, so that
+iteratively reweighted least squares minimises the sum of rho (Black and Rangarajan
+1996). rho(r) -> r^2 / 2 as r -> 0, except L1, where it is about |r|.
+
+A kernel is redescending if its weights fall faster than 1 / r, so that distant
+residuals lose their pull: right for outliers and partial overlap near the solution,
+wrong far from it. Which to take:
+
+    no outliers                              L2
+    far from the solution                    L1, Huber
+    near it, clutter or partial overlap      GemanMcClure, Cauchy, Correntropy, Tukey
+    the share of the overlap is known        Trimmed
+
+Widths of zero and residuals of zero are safe: weights are finite, nothing is NaN.
 """
 
 import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core.arrays import traced
+from jaxreg._core.quantile import masked_quantile
+
+
+Values = Float[Array, "*n"]
+Width = Float[Array, ""]
 
 
 class AbstractKernel(eqx.Module):
     """A robust loss of a residual norm, given squared."""
 
     @abc.abstractmethod
-    def rho(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
+    def rho(self, sq_residual: Values, width: Width) -> Values:
         """The loss."""
 
     @abc.abstractmethod
-    def weight(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
+    def weight(self, sq_residual: Values, width: Width) -> Values:
         """rho'(r) / r: the weight of the residual in a least-squares step."""
+
+    def width_of(
+        self, sq_residual: Float[Array, " n"], mask: Bool[Array, " n"]
+    ) -> Width:
+        """The width that the data suggest, in the unit of the residual.
+
+        Three times the lower third of the norms: it follows the residuals of the
+        points that fit, as long as a third of the points do. (Of a Gaussian residual
+        in one dimension, the lower third is 0.43 standard deviations.)
+
+        Args:
+            sq_residual: `(n,)` squared residual norms.
+            mask: `(n,)` which of them are valid.
+
+        Returns:
+            The width; zero where nothing is valid.
+
+        Gradients: none.
+        """
+        return 3 * jnp.sqrt(masked_quantile(sq_residual, mask, 1 / 3))
+
+
+def _square(width: Width) -> Width:
+    """The width squared, never zero, so that quotients by it are not NaN."""
+    return jnp.maximum(width * width, jnp.finfo(width.dtype).tiny)
 
 
 class L2(AbstractKernel):
-    """rho = r^2 / 2: every residual counts alike. Ignores the width."""
+    """rho = r^2 / 2: every residual counts alike. Ignores the width.
 
-    def rho(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
+    Not redescending. The fastest and most accurate without outliers, ruined by one.
+    """
+
+    def rho(self, sq_residual: Values, width: Width) -> Values:
         """r^2 / 2."""
         return sq_residual / 2
 
-    def weight(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
+    def weight(self, sq_residual: Values, width: Width) -> Values:
         """One."""
         return jnp.ones_like(sq_residual)
 
@@ -52,50 +90,133 @@ class L1(AbstractKernel):
     from the solution.
     """
 
-    def rho(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
-        """sqrt(r^2 + width^2) - width."""
-        return jnp.sqrt(sq_residual + width**2) - width
+    def rho(self, sq_residual: Values, width: Width) -> Values:
+        """sqrt(r^2 + width^2) - width, written so that it does not cancel near zero."""
+        scale = jnp.sqrt(_square(width))
+        return sq_residual / (jnp.sqrt(sq_residual + _square(width)) + scale)
 
-    def weight(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
+    def weight(self, sq_residual: Values, width: Width) -> Values:
         """1 / sqrt(r^2 + width^2)."""
-        return 1 / jnp.sqrt(sq_residual + width**2)
+        return 1 / jnp.sqrt(sq_residual + _square(width))
+
+
+class Huber(AbstractKernel):
+    """rho = r^2 / 2 up to the width, width (r - width / 2) beyond (Huber 1964).
+
+    Convex and not redescending: least squares for the points that fit, and a bounded,
+    but not vanishing, pull of the others. A safe choice far from the solution.
+    """
+
+    def rho(self, sq_residual: Values, width: Width) -> Values:
+        """r^2 / 2, or width (r - width / 2) where r > width."""
+        sq_width = _square(width)
+        # Clipped below at the width: the root of zero has no finite slope.
+        norm = jnp.sqrt(jnp.maximum(sq_residual, sq_width))
+        far = jnp.sqrt(sq_width) * norm - sq_width / 2
+        return jnp.where(sq_residual <= sq_width, sq_residual / 2, far)
+
+    def weight(self, sq_residual: Values, width: Width) -> Values:
+        """One, or width / r where r > width."""
+        sq_width = _square(width)
+        return jnp.sqrt(sq_width / jnp.maximum(sq_residual, sq_width))
+
+
+class Cauchy(AbstractKernel):
+    """rho = width^2 / 2 log(1 + r^2 / width^2): the likelihood of a Cauchy residual.
+
+    Redescending, but gently: rho is not bounded, and distant residuals keep a little
+    pull. Between Huber and GemanMcClure when the start is neither near nor far.
+    """
+
+    def rho(self, sq_residual: Values, width: Width) -> Values:
+        """width^2 / 2 log(1 + r^2 / width^2)."""
+        sq_width = _square(width)
+        return sq_width / 2 * jnp.log1p(sq_residual / sq_width)
+
+    def weight(self, sq_residual: Values, width: Width) -> Values:
+        """1 / (1 + r^2 / width^2)."""
+        return 1 / (1 + sq_residual / _square(width))
 
 
 class GemanMcClure(AbstractKernel):
-    """rho = r^2 / 2 / (1 + r^2 / width^2): redescending and bounded by width^2 / 2.
+    """rho = r^2 / 2 / (1 + r^2 / width^2): bounded by width^2 / 2.
 
-    Residuals far beyond the width stop counting: right for partial overlap, but only
-    near the solution.
+    Geman and McClure 1985. Redescending: residuals far beyond the width stop counting,
+    right for partial overlap, but only near the solution, or with a width that starts
+    large.
     """
 
-    def rho(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
+    def rho(self, sq_residual: Values, width: Width) -> Values:
         """r^2 / 2 / (1 + r^2 / width^2)."""
-        return sq_residual / 2 / (1 + sq_residual / width**2)
+        sq_width = _square(width)
+        return sq_width / 2 * (sq_residual / (sq_residual + sq_width))
 
-    def weight(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
+    def weight(self, sq_residual: Values, width: Width) -> Values:
         """1 / (1 + r^2 / width^2)^2."""
-        return 1 / (1 + sq_residual / width**2) ** 2
+        return 1 / (1 + sq_residual / _square(width)) ** 2
+
+
+class Tukey(AbstractKernel):
+    """rho = width^2 / 6 (1 - (1 - r^2 / width^2)^3) up to the width, constant beyond.
+
+    The biweight of Beaton and Tukey 1974. Redescending, and residuals beyond the width
+    do not count at all: for the last steps, when outliers are well apart from the rest.
+    """
+
+    def rho(self, sq_residual: Values, width: Width) -> Values:
+        """width^2 / 6 (1 - (1 - u)^3) with u = r^2 / width^2 clipped at one."""
+        sq_width = _square(width)
+        u = jnp.minimum(sq_residual / sq_width, 1)
+        # 1 - (1 - u)^3 expanded: no cancellation near zero.
+        return sq_width / 6 * u * (3 - u * (3 - u))
+
+    def weight(self, sq_residual: Values, width: Width) -> Values:
+        """(1 - u)^2 with u = r^2 / width^2 clipped at one."""
+        return (1 - jnp.minimum(sq_residual / _square(width), 1)) ** 2
 
 
 class Correntropy(AbstractKernel):
-    """rho = width^2 (1 - exp(-r^2 / (2 width^2))): Welsch; MCC paper, Eq. 3, 4."""
+    """rho = width^2 (1 - exp(-r^2 / (2 width^2))): Welsch; MCC paper, Eq. 3, 4.
 
-    def rho(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
+    Redescending and bounded by width^2. Its weights are Gaussian in the residual: the
+    choice where the noise of the good residuals is Gaussian of that width.
+    """
+
+    def rho(self, sq_residual: Values, width: Width) -> Values:
         """width^2 (1 - exp(-r^2 / (2 width^2)))."""
-        return -(width**2) * jnp.expm1(-sq_residual / (2 * width**2))
+        sq_width = _square(width)
+        return -sq_width * jnp.expm1(-sq_residual / (2 * sq_width))
 
-    def weight(
-        self, sq_residual: Float[Array, "*n"], width: Float[Array, ""]
-    ) -> Float[Array, "*n"]:
+    def weight(self, sq_residual: Values, width: Width) -> Values:
         """exp(-r^2 / (2 width^2))."""
-        return jnp.exp(-sq_residual / (2 * width**2))
+        return jnp.exp(-sq_residual / (2 * _square(width)))
+
+
+class Trimmed(AbstractKernel):
+    """rho = min(r^2, width^2) / 2: a fixed share of the residuals counts, fully.
+
+    Trimmed ICP (Chetverikov, Stepanov, Krsek 2005) with the least squares of the
+    closest points. Redescending, and hard: the choice where the share of the overlap
+    is known. The width is the distance that `share` of the residuals do not exceed.
+
+    Attributes:
+        share: the part of the residuals that counts, in (0, 1].
+    """
+
+    share: Array | float = traced(0.7)
+
+    def rho(self, sq_residual: Values, width: Width) -> Values:
+        """min(r^2, width^2) / 2."""
+        return jnp.minimum(sq_residual, width * width) / 2
+
+    def weight(self, sq_residual: Values, width: Width) -> Values:
+        """One up to the width, zero beyond."""
+        # A hair of tolerance: the root of the quantile, squared, may round down.
+        reach = width * width * (1 + 4 * jnp.finfo(width.dtype).eps)
+        return (sq_residual <= reach).astype(sq_residual.dtype)
+
+    def width_of(
+        self, sq_residual: Float[Array, " n"], mask: Bool[Array, " n"]
+    ) -> Width:
+        """The `share` quantile of the residual norms; zero where nothing is valid."""
+        return jnp.sqrt(masked_quantile(sq_residual, mask, self.share))

