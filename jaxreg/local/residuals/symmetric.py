@@ -33,7 +33,7 @@ class Symmetric(AbstractResidual):
     def normal_equations(
         self, match: Match, weight: Float[Array, " n"]
     ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
-        """The Gram matrix of rows (n, x cross n + r cross n_p, n . r), n = n_p + n_q."""
+        """The Gram matrix of rows (n, x cross n + r cross n_p, n . r)."""
         p, n, r = _source_normal(match), _normal_sum(match), match.residual
         turn = [
             a + b for a, b in zip(cross(match.rotated, n), cross(r, p), strict=True)

@@ -7,11 +7,11 @@ diagonal entry of H is then the same.
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
 from jaxreg.local.problem import Match, sum_rows
 from jaxreg.local.residuals.gram import half_sum
+from jaxreg.local.steps.tiny_solve import solve_semidefinite
 
 
 class Scaled(eqx.Module):
@@ -46,15 +46,15 @@ class Scaled(eqx.Module):
         scale = jnp.where(stiffness > 0, 1 / jnp.where(stiffness > 0, stiffness, 1), 0)
         return cls(scale * H * unit[:, None] * unit, scale * b * unit, unit)
 
-    def solve(self, damping: Float[Array, ""]) -> Float[Array, " k"]:
+    def solve(self, damping: Float[Array, ""] | float) -> Float[Array, " k"]:
         """The tangent (v, w) that solves (H + damping I) x = b.
 
         A direction that the data leave free, whose eigenvalue is far below the
         damping, is left alone.
         """
         eye = jnp.eye(self.b.shape[0], dtype=self.b.dtype)
-        factor = cho_factor(self.H + damping * eye)
-        return self.unit * cho_solve(factor, self.b)
+        damped = self.H + jnp.asarray(damping, self.b.dtype) * eye
+        return self.unit * solve_semidefinite(damped, self.b)
 
 
 def gyration_radius(match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
