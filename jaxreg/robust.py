@@ -64,8 +64,11 @@ class AbstractKernel(eqx.Module):
 
 
 def _square(width: Width) -> Width:
-    """The width squared, never zero, so that quotients by it are not NaN."""
-    return jnp.maximum(width * width, jnp.finfo(width.dtype).tiny)
+    """The width squared, but large enough that its square in turn is not zero.
+
+    Then quotients by it, and their derivatives, are not NaN (3e-10 in float32).
+    """
+    return jnp.maximum(width * width, jnp.finfo(width.dtype).tiny ** 0.49)
 
 
 class L2(AbstractKernel):
