@@ -50,7 +50,7 @@ def _evaluate(kernel, norm, width):
     return rho, kernel.weight(norm * norm, width), pull
 
 
-def _at(kernel, norm, width, dtype=np.float32):
+def _at(kernel, norm, width, dtype: type = np.float32):
     """The same in NumPy, for up to 40 norms."""
     norm = np.asarray(norm, dtype)
     padded = jnp.asarray(np.resize(norm, 40))

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from helpers import blob, motion, move
-from scipy.spatial import cKDTree
+from numpy.typing import DTypeLike
+from scipy.spatial import KDTree
 
 from jaxreg.cloud import PointCloud
 from jaxreg.local import Problem, match
@@ -24,13 +25,15 @@ class RowByRow(BruteForce):
 
 def normals_of(points: np.ndarray) -> np.ndarray:
     """Unit normals of either sign from the eight closest points."""
-    rows = cKDTree(points).query(points, 8)[1]
+    rows = KDTree(points).query(points, 8)[1]
     around = points[rows] - points[rows].mean(axis=1, keepdims=True)
     normals = np.linalg.svd(around, full_matrices=False)[2][:, -1]
     return normals.astype(points.dtype)
 
 
-def problem_of(source, source_normals, target, target_normals, index=RowByRow):
+def problem_of(
+    source, source_normals, target, target_normals, index: type[BruteForce] = RowByRow
+):
     """The problem of NumPy arrays; row by row unless another index is given."""
     source, source_normals, target, target_normals = map(
         jnp.asarray, (source, source_normals, target, target_normals)
@@ -42,7 +45,7 @@ def problem_of(source, source_normals, target, target_normals, index=RowByRow):
     )
 
 
-def noisy_problem(d: int, dtype=np.float64):
+def noisy_problem(d: int, dtype: DTypeLike = np.float64):
     """A problem whose normals are random and residuals large, and a pose and weights.
 
     Nothing in it vanishes by accident.

@@ -26,6 +26,7 @@ from jaxreg.local import (
     moved,
     turn_and_shift,
 )
+from jaxreg.local.steps.tiny_solve import solve_semidefinite
 from jaxreg.neighbours import BruteForce
 from jaxreg.robust import L2, Huber
 
@@ -75,7 +76,10 @@ def test_units_do_not_matter(step):
     mm = eqx.tree_at(
         lambda p: (p.source, p.target),
         problem,
-        (1000 * problem.source, problem.target * np.repeat(np.float32([1000, 1]), 3)),
+        (
+            1000 * problem.source,
+            problem.target * np.repeat(np.array([1000, 1], np.float32), 3),
+        ),
     )
     T_mm = T.at[:3, 3].multiply(1000)
     T_new = _step(step, Symmetric(), T, found_at(problem, T), weight)
@@ -217,10 +221,10 @@ def test_condition_tells_what_the_data_leave_free():
     assert plane > 1e-3
     same = np.array(of(1000 * shape))
     np.testing.assert_allclose(same, [points, plane], rtol=1e-2)
-    flat_points, flat_plane = of(shape * np.float32([1, 1, 0]))
+    flat_points, flat_plane = of(shape * np.array([1, 1, 0], np.float32))
     assert flat_points > 0.1
     assert flat_plane < 1e-6
-    assert of(shape * np.float32([1, 0, 0]))[0] < 1e-6
+    assert of(shape * np.array([1, 0, 0], np.float32))[0] < 1e-6
     ball = shape / np.linalg.norm(shape, axis=1, keepdims=True)
     posed = problem_of(ball, ball, ball, ball)
     assert float(conditions(found_at(posed, T))[1]) < 1e-6
@@ -258,14 +262,28 @@ def test_every_residual_and_step_converge_from_five_degrees(d):
         assert shift < 2e-3, (residual, step)
 
 
-def test_repeated_steps_are_one_compiled_loop():
+def test_repeated_steps_are_one_compiled_loop_over_a_batch_of_poses():
     problem, T_true, start = _five_degrees_off(3)
     optimiser = LocalOptimiser(Symmetric(), Huber(), LevenbergMarquardt())
     widths = jnp.full(20, 0.1, jnp.float32)
-    T = eqx.filter_jit(optimiser.repeat)(problem, start, widths)
-    angle, shift = pose_error(T, T_true)
-    assert angle < 1e-3
-    assert shift < 1e-3
+    starts = jnp.stack([start, start.at[0, 3].add(0.05)])
+    for T in jax.jit(jax.vmap(lambda T: optimiser.repeat(problem, T, widths)))(starts):
+        angle, shift = pose_error(T, T_true)
+        assert angle < 1e-3
+        assert shift < 1e-3
+
+
+@pytest.mark.parametrize("rank", [6, 4, 0])
+def test_tiny_systems_are_solved_and_free_directions_get_nothing(rank):
+    rng = np.random.default_rng(rank)
+    rows = rng.integers(-4, 5, (rank, 6)).astype(np.float32)
+    A, b = rows.T @ rows, rows.T @ rng.standard_normal(rank).astype(np.float32)
+    x = np.asarray(_solve(jnp.asarray(A), jnp.asarray(b)))
+    np.testing.assert_allclose(A @ x, b, atol=1e-3)
+    assert np.sum(x != 0) == rank
+
+
+_solve = jax.jit(solve_semidefinite)
 
 
 @in_2d_and_3d
