@@ -48,6 +48,7 @@ from jaxreg._core.status import Status as Status
 from jaxreg.averaging import AveragingSolution as AveragingSolution
 from jaxreg.averaging import Correntropy as Correntropy
 from jaxreg.averaging import MotionAveraging as MotionAveraging
+from jaxreg.averaging import PoseGraphLM as PoseGraphLM
 from jaxreg.averaging import SpanningTree as SpanningTree
 from jaxreg.averaging import WeightedMotionAveraging as WeightedMotionAveraging
 from jaxreg.averaging import average as average

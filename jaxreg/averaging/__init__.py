@@ -7,4 +7,5 @@ from jaxreg.averaging.consensus import CycleConsensus as CycleConsensus
 from jaxreg.averaging.correntropy import Correntropy as Correntropy
 from jaxreg.averaging.plain import MotionAveraging as MotionAveraging
 from jaxreg.averaging.plain import WeightedMotionAveraging as WeightedMotionAveraging
+from jaxreg.averaging.posegraph_lm import PoseGraphLM as PoseGraphLM
 from jaxreg.averaging.tree import SpanningTree as SpanningTree

@@ -10,11 +10,11 @@ coarse system with one unknown per block. Numbering frames along the trajectory 
 them; any numbering is right.
 """
 
-from typing import NamedTuple
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from jaxreg.averaging.krylov import conjugate_gradients
+from jaxreg.averaging.two_level import two_level
 
 
 #: Largest number of frames for which a dense matrix over frames is formed.
@@ -67,97 +67,22 @@ def laplacian(
     return L.at[0].set(0).at[:, 0].set(0).at[0, 0].set(1)
 
 
-class TwoLevel(NamedTuple):
-    """Exact solves in blocks plus a coarse solve: call it on `(v, k)`."""
-
-    blocks: Array  # (b, s, s) inverses of the diagonal blocks
-    coarse: Array  # (b, b) inverse of the Galerkin matrix
-    held: Array  # (v, 1) 1 for the frames that some weight holds, 0 for frame 0
-
-    def __call__(self, r: Array) -> Array:
-        """Approximately solves for right-hand sides r."""
-        num_poses, k = r.shape
-        b, s, _ = self.blocks.shape
-        padded = jnp.pad(r, [(0, b * s - num_poses), (0, 0)]).reshape(b, s, k)
-        fine = self.blocks @ padded
-        lift = self.coarse @ jnp.sum(padded, axis=1)
-        both = fine + lift[:, None, :]
-        return both.reshape(b * s, k)[:num_poses] * self.held
-
-
-def two_level(edges: Array, weight: Array, num_poses: int) -> TwoLevel:
-    """An approximate inverse of the Laplacian, with frame 0 held."""
-    s = _BLOCK
-    b = -(-num_poses // s)
-    i, j = edges[:, 0], edges[:, 1]
-    bi, bj, li, lj = i // s, j // s, i % s, j % s
-    same = jnp.where(bi == bj, weight, 0)
-    blocks = jnp.zeros((b, s, s), weight.dtype)
-    blocks = blocks.at[bi, li, li].add(weight).at[bj, lj, lj].add(weight)
-    blocks = blocks.at[bi, li, lj].add(-same).at[bi, lj, li].add(-same)
-    across = weight - same
-    coarse = jnp.zeros((b, b), weight.dtype)
-    coarse = coarse.at[bi, bi].add(across).at[bj, bj].add(across)
-    coarse = coarse.at[bi, bj].add(-across).at[bj, bi].add(-across)
-    # Frame 0 is tied to the ground, which also fixes the level of the coarse system.
-    ground = jnp.sum(jnp.where((i == 0) | (j == 0), weight, 0))
-    blocks = blocks.at[0, 0, 0].add(ground)
-    coarse = coarse.at[0, 0].add(ground)
-    touched = jnp.zeros((num_poses,), weight.dtype).at[i].add(weight).at[j].add(weight)
-    held = (touched > 0).at[0].set(False).astype(weight.dtype)[:, None]
-    return TwoLevel(_ridged_inverse(blocks), _ridged_inverse(coarse), held)
-
-
-def _ridged_inverse(A: Array) -> Array:
-    """Inverses of semidefinite matrices whose empty rows are left alone."""
-    n = A.shape[-1]
-    eye = jnp.eye(n, dtype=A.dtype)
-    diagonal = jnp.diagonal(A, axis1=-2, axis2=-1)
-    ridge = jnp.where(diagonal > 0, diagonal * 30 * jnp.finfo(A.dtype).eps, 1)
-    factor = jnp.linalg.cholesky(A + ridge[..., None] * eye)
-    eyes = jnp.broadcast_to(eye, A.shape)
-    half = jax.lax.linalg.triangular_solve(factor, eyes, left_side=True, lower=True)
-    return jnp.swapaxes(half, -1, -2) @ half
-
-
-class _CG(NamedTuple):
-    x: Array
-    r: Array
-    p: Array
-    rz: Array
-    step: Array
-
-
 def _conjugate_gradients(edges: Array, weight: Array, rhs: Array) -> Array:
     """Preconditioned conjugate gradients, the k columns side by side."""
     num_poses = rhs.shape[0]
     i, j = edges[:, 0], edges[:, 1]
-    precondition = two_level(edges, weight, num_poses)
+    inverse = two_level(edges, weight[:, None, None], num_poses, _BLOCK)
 
     def apply(x: Array) -> Array:
         return (
             divergence(edges, weight[:, None] * (x[j] - x[i]), num_poses).at[0].set(0)
         )
 
-    tolerance = 10 * jnp.finfo(rhs.dtype).eps ** 2
-    z = precondition(rhs)
-    rz = jnp.sum(rhs * z, axis=0)
-    stop = jnp.maximum(tolerance * rz, jnp.finfo(rhs.dtype).tiny)
-
-    def unfinished(s: _CG) -> Array:
-        return jnp.any(s.rz > stop) & (s.step < 500)
-
-    def step(s: _CG) -> _CG:
-        Ap = apply(s.p)
-        pAp = jnp.sum(s.p * Ap, axis=0)
-        alive = (pAp > 0) & (s.rz > stop)
-        a = jnp.where(alive, s.rz / jnp.where(alive, pAp, 1), 0)
-        x, r = s.x + a * s.p, s.r - a * Ap
-        z = precondition(r)
-        rz = jnp.where(alive, jnp.sum(r * z, axis=0), 0)
-        beta = jnp.where(alive, rz / jnp.where(alive, s.rz, 1), 0)
-        return _CG(x, r, z + beta * s.p, rz, s.step + 1)
-
-    zero = jnp.zeros_like(rhs)
-    begin = _CG(zero, rhs, z, rz, jnp.asarray(0, jnp.int32))
-    return jax.lax.while_loop(unfinished, step, begin).x
+    return conjugate_gradients(
+        apply,
+        lambda r: inverse(r[:, None, :])[:, 0, :],
+        rhs,
+        columns=True,
+        tolerance=3 * float(jnp.finfo(rhs.dtype).eps),
+        max_steps=500,
+    )[0]

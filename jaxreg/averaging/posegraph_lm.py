@@ -1,0 +1,266 @@
+"""Levenberg-Marquardt on all poses of a graph (the G2O baseline of the MCC paper).
+
+Unknowns are left tangents around the current poses, T_world_i <- exp(x_i) T_world_i;
+poses are updated after each step, so they stay on the group. The error of an edge then
+depends on x_j - x_i alone, and the Gauss-Newton matrix is a graph Laplacian with k x k
+weights, which is never formed beyond blocks: conjugate gradients work on the edges.
+"""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg._core.arrays import traced
+from jaxreg._core.typing import Key
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
+from jaxreg.averaging.iterate import nearby_rotation
+from jaxreg.averaging.krylov import conjugate_gradients
+from jaxreg.averaging.laplacian import divergence
+from jaxreg.averaging.plain import MotionAveraging
+from jaxreg.averaging.tree import start
+from jaxreg.averaging.two_level import TwoLevel, two_level
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
+from jaxreg.robust import AbstractKernel
+
+
+# Unknowns below which the preconditioner is exact, in one of its blocks, and at most in
+# its coarse system; steps after which it is built anew.
+_EXACT, _BLOCK, _COARSE, _STALE = 384, 96, 1500, 60
+
+
+class PoseGraphLM(AbstractAverager):
+    """Least squares over the graph, with information matrices.
+
+    Attributes:
+        objective: "log" for the sum of r' Omega r with the tangent error
+            r = log(inv(T_i_j) inv(T_world_i) T_world_j) of g2o and GTSAM, Omega the
+            weight times the information (the identity without); "chordal" for the
+            objective of SE-Sync, `jaxreg.metrics.chordal_objective` (static).
+        kernel: a robust kernel of `jaxreg.robust` over sqrt(r' Omega r) of each edge,
+            or None for plain least squares, which outliers pull away.
+        kernel_width: its width; in standard deviations if the information is that of
+            the noise.
+        max_steps: largest number of steps (static).
+        tolerance: stop when a step lowers the objective by less than this share.
+        initialiser: finds the start when `init` is None.
+
+    The length unit matters without information, as an error of one radian counts as
+    one of a unit length. `edge_weight` is the kernel's.
+
+    Gradients: none (cut); differentiate `Correntropy` or `MotionAveraging`.
+
+    Reference: Kuemmerle, Grisetti et al. 2011 (g2o); Rosen et al. 2019 (SE-Sync).
+    """
+
+    objective: Literal["log", "chordal"] = eqx.field(static=True, default="log")
+    kernel: AbstractKernel | None = None
+    kernel_width: Array | float = traced(3.0)
+    max_steps: int = eqx.field(static=True, default=50)
+    tolerance: Array | float = traced(1e-6)
+    initialiser: AbstractAverager = MotionAveraging(max_steps=3)
+
+    def __check_init__(self) -> None:
+        if self.objective not in ("log", "chordal"):
+            raise ValueError(
+                f"objective: wanted 'log' or 'chordal', found {self.objective!r}."
+            )
+
+    def solve(
+        self,
+        graph: PoseGraph,
+        init: Float[Array, "v D D"] | None,
+        key: Key | None,
+    ) -> AveragingSolution:
+        """Minimises the objective of a prepared graph."""
+        graph, self = jax.lax.stop_gradient((graph, self))
+        T_start = jax.lax.stop_gradient(start(self.initialiser, graph, init, key))
+        problem = self._problem(graph)
+        cost = problem.cost(T_start)
+        limit = jnp.maximum(self.tolerance, 4 * jnp.finfo(cost.dtype).eps)
+        damping = jnp.asarray(1e-7, cost.dtype)
+        begin = _State(
+            T=T_start,
+            cost=cost,
+            damping=damping,
+            inverse=_inverse(graph, problem.normal(T_start)[0], damping),
+            gain=jnp.asarray(jnp.inf, cost.dtype),
+            step=jnp.asarray(0, jnp.int32),
+        )
+        end = jax.lax.while_loop(
+            lambda s: (s.gain > limit) & (s.step < self.max_steps),
+            lambda s: _try_step(problem, s),
+            begin,
+        )
+        return solution(
+            graph,
+            end.T,
+            edge_weight=problem.trust(problem.squares(end.T)),
+            converged=end.gain <= limit,
+            num_steps=end.step,
+        )
+
+    def _problem(self, graph: PoseGraph) -> "_Problem":
+        if self.objective == "chordal":
+            error, precision = _chordal_error, _chordal_precision(graph)
+        else:
+            error, precision = _log_error, _log_precision(graph)
+        if self.kernel is None:
+            return _Problem(graph, error, precision, lambda s: s, jnp.ones_like)
+        kernel, width = self.kernel, jnp.asarray(self.kernel_width)
+        return _Problem(
+            graph,
+            error,
+            precision,
+            lambda s: 2 * kernel.rho(s, width),
+            lambda s: kernel.weight(s, width),
+        )
+
+
+class _Problem(NamedTuple):
+    """The sum of loss(r' Omega r) over the edges; trust is its derivative."""
+
+    graph: PoseGraph
+    error: Callable[[Array, Array], Array]
+    precision: Array
+    loss: Callable[[Array], Array]
+    trust: Callable[[Array], Array]
+
+    def squares(self, T: Array) -> Array:
+        """The squared error r' Omega r of each edge."""
+        r = self.error(_predicted(self.graph, T), self.graph.T_i_j)
+        return jnp.sum(r * jnp.sum(self.precision * r[:, None, :], axis=-1), axis=-1)
+
+    def cost(self, T: Array) -> Array:
+        """The objective."""
+        return jnp.sum(self.loss(self.squares(T)))
+
+    def normal(self, T: Array) -> tuple[Array, Array]:
+        """J' Omega J `(e, k, k)` and J' Omega r `(e, k)` with respect to x_j - x_i."""
+        i, j = self.graph.edges[:, 0], self.graph.edges[:, 1]
+        T_i_world = lie.inverse(T)[i]
+        predicted = product(T_i_world, T[j])
+
+        def along(generator: Array) -> tuple[Array, Array]:
+            moved = product(product(T_i_world, generator[None]), T[j])
+            return jax.jvp(
+                lambda P: self.error(P, self.graph.T_i_j), (predicted,), (moved,)
+            )
+
+        r, J = jax.vmap(along, out_axes=(None, -1))(_generators(T))
+        trust = self.trust(self.squares(T))[:, None, None]
+        WJ = product(trust * self.precision, J)
+        Q = product(jnp.swapaxes(J, -1, -2), WJ)
+        return Q, jnp.sum(WJ * r[:, :, None], axis=-2)
+
+
+class _State(NamedTuple):
+    T: Array
+    cost: Array
+    damping: Array
+    inverse: TwoLevel  # of the normal equations at this or an earlier step
+    gain: Array  # share of the cost that the last step took away
+    step: Array
+
+
+def _predicted(graph: PoseGraph, T: Array) -> Array:
+    return product(lie.inverse(T)[graph.edges[:, 0]], T[graph.edges[:, 1]])
+
+
+def _generators(T: Array) -> Array:
+    """The derivative of exp at 0 along each tangent coordinate, `(k, D, D)`."""
+    k = lie.tangent_dim(T.shape[-1] - 1)
+    zero = jnp.zeros((k,), T.dtype)
+    return jnp.moveaxis(jax.jacfwd(lie.exp)(zero), -1, 0)
+
+
+def _log_error(predicted: Array, T_i_j: Array) -> Array:
+    return lie.log(product(lie.inverse(T_i_j), predicted))
+
+
+def _log_precision(graph: PoseGraph) -> Array:
+    k = lie.tangent_dim(graph.dim)
+    info = graph.information
+    if info is None:
+        info = jnp.eye(k, dtype=graph.weight.dtype)
+    return graph.weight[:, None, None] * info
+
+
+def _chordal_error(predicted: Array, T_i_j: Array) -> Array:
+    gap = (predicted - T_i_j)[:, :-1]
+    rotation = gap[..., :-1].reshape(gap.shape[0], -1)
+    return jnp.concatenate([rotation, gap[..., -1]], axis=-1)
+
+
+def _chordal_precision(graph: PoseGraph) -> Array:
+    kappa, tau = chordal_weights(graph)
+    d = graph.dim
+    parts = [jnp.repeat(kappa[:, None], d * d, 1), jnp.repeat(tau[:, None], d, 1)]
+    return jax.vmap(jnp.diag)(jnp.concatenate(parts, axis=1))
+
+
+def _try_step(problem: _Problem, s: _State) -> _State:
+    """One damped step, kept if it lowers the cost."""
+    Q, force = problem.normal(s.T)
+    x, rounds = _solve_step(problem.graph, Q, force, s)
+    T = nearby_rotation(product(lie.exp(x), s.T))
+    cost = problem.cost(T)
+    better = cost <= s.cost
+    gain = jnp.where(s.cost > 0, (s.cost - cost) / jnp.where(s.cost > 0, s.cost, 1), 0)
+    # A refused step calls for more damping, unless damping can help no more.
+    refused = jnp.where(s.damping < 1e3, jnp.inf, 0)
+    damping = jnp.where(better, jnp.maximum(s.damping / 10, 1e-9), s.damping * 30)
+    inverse = jax.lax.cond(
+        rounds > _STALE,
+        lambda: _inverse(problem.graph, Q, damping),
+        lambda: s.inverse,
+    )
+    return _State(
+        T=jnp.where(better, T, s.T),
+        cost=jnp.where(better, cost, s.cost),
+        damping=damping,
+        inverse=inverse,
+        gain=jnp.where(better, gain, refused).astype(cost.dtype),
+        step=s.step + 1,
+    )
+
+
+def _inverse(graph: PoseGraph, Q: Array, damping: Array) -> TwoLevel:
+    """About (H + damping diag(H))^-1, H = B' Q B, frame 0 held."""
+    num, k = graph.num_poses, Q.shape[-1]
+    block = max(_BLOCK // k, -(-num * k // _COARSE))
+    block = num if num * k <= _EXACT else block
+    return two_level(graph.edges, Q, num, block, damping * _diagonal(graph, Q))
+
+
+def _diagonal(graph: PoseGraph, Q: Array) -> Array:
+    i, j = graph.edges[:, 0], graph.edges[:, 1]
+    zero = jnp.zeros((graph.num_poses, *Q.shape[1:]), Q.dtype)
+    return zero.at[i].add(Q).at[j].add(Q)
+
+
+def _solve_step(
+    graph: PoseGraph, Q: Array, force: Array, s: _State
+) -> tuple[Array, Array]:
+    """-(H + damping diag(H))^-1 B' force with x_0 = 0, and the rounds it took."""
+    num = graph.num_poses
+    i, j = graph.edges[:, 0], graph.edges[:, 1]
+    extra = s.damping * _diagonal(graph, Q)
+
+    def apply(x: Array) -> Array:
+        flow = jnp.sum(Q * (x[j] - x[i])[:, None, :], axis=-1)
+        own = jnp.sum(extra * x[:, None, :], axis=-1)
+        return (divergence(graph.edges, flow, num) + own).at[0].set(0)
+
+    return conjugate_gradients(
+        apply,
+        lambda r: s.inverse(r[..., None])[..., 0],
+        -divergence(graph.edges, force, num).at[0].set(0),
+        columns=False,
+        tolerance=1e-2,
+        max_steps=300,
+    )

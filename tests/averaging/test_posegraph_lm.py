@@ -1,0 +1,143 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from jaxreg._core.status import Status
+from jaxreg.averaging import PoseGraphLM, average
+from jaxreg.graph import PoseGraph
+from jaxreg.io import read_g2o
+from jaxreg.metrics import chordal_objective
+from jaxreg.robust import GemanMcClure
+from tests.averaging.graphs import motions, random_graph
+from tests.helpers import data_dir
+
+
+N, H = 6, 12
+
+
+def problem(d: int, outliers: float = 0.0):
+    X, edges, T, bad = random_graph(N, H, outliers, 1, d=d, noise=10.0)
+    rng = np.random.default_rng(0)
+    k = 6 if d == 3 else 3
+    half = rng.normal(size=(H, k, k))
+    weight = rng.uniform(0.5, 2, H)
+    information = np.eye(k) + half @ half.swapaxes(1, 2)
+    return X, edges, T, weight, information, bad
+
+
+def poses(x: np.ndarray, d: int, start: np.ndarray) -> np.ndarray:
+    """Starting poses turned and shifted by parameters, pose 0 held."""
+    x = np.concatenate([np.zeros((1, x.size // (N - 1))), x.reshape(N - 1, -1)])
+    if d == 3:
+        R = Rotation.from_rotvec(x[:, 3:]).as_matrix()
+    else:
+        turn = np.concatenate([np.zeros((N, 2)), x[:, 2:]], axis=1)
+        R = Rotation.from_rotvec(turn).as_matrix()[:, :2, :2]
+    return start @ motions(R, x[:, :d])
+
+
+def log_errors(graph: tuple, T: np.ndarray) -> np.ndarray:
+    """log(inv(T_i_j) inv(T_i) T_j) by closed forms, whitened."""
+    _, edges, motion, weight, information, _ = graph
+    gap = np.linalg.inv(motion) @ np.linalg.inv(T[edges[:, 0]]) @ T[edges[:, 1]]
+    d = gap.shape[-1] - 1
+    out = []
+    for G, w, info in zip(gap, weight, information, strict=True):
+        if d == 3:
+            v = Rotation.from_matrix(G[:3, :3]).as_rotvec()
+            W = np.cross(np.eye(3), v)
+            a = np.linalg.norm(v)
+            c = (1 - a * np.sin(a) / (2 * (1 - np.cos(a)))) / a**2
+            V = np.eye(3) - W / 2 + c * W @ W
+        else:
+            v = np.array([np.arctan2(G[1, 0], G[0, 0])])
+            half = v[0] / 2
+            V = half / np.tan(half) * np.eye(2) + half * np.array([[0, 1], [-1, 0]])
+        r = np.concatenate([V @ G[:d, d], v])
+        out.append(np.linalg.cholesky(w * info).T @ r)
+    return np.array(out)
+
+
+def chordal_errors(graph: tuple, T: np.ndarray) -> np.ndarray:
+    _, edges, motion, weight, information, _ = graph
+    d = T.shape[-1] - 1
+    gap = T[edges[:, 1]] - T[edges[:, 0]] @ motion
+    tau = d / np.trace(np.linalg.inv(information[:, :d, :d]), axis1=1, axis2=2)
+    if d == 3:
+        rotation = np.linalg.inv(information[:, 3:, 3:])
+        kappa = 1.5 / np.trace(rotation, axis1=1, axis2=2)
+    else:
+        kappa = information[:, 2, 2]
+    R = gap[:, :d, :d].reshape(H, -1) * np.sqrt(weight * kappa)[:, None]
+    t = gap[:, :d, d] * np.sqrt(weight * tau)[:, None]
+    return np.concatenate([R, t], axis=1)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("objective", ["log", "chordal"])
+def test_minimum_against_scipy(objective, d):
+    graph = problem(d)
+    X, edges, T, weight, information, _ = graph
+    errors = log_errors if objective == "log" else chordal_errors
+    best = least_squares(
+        lambda x: errors(graph, poses(x, d, X)).ravel(),
+        np.zeros((N - 1) * information.shape[-1]),
+        xtol=1e-12,
+        ftol=1e-12,
+    )
+    with jax.enable_x64(True):
+        posed = PoseGraph.from_edges(edges, T, N, weight, information)
+        method = PoseGraphLM(objective=objective, tolerance=1e-12)
+        solution = average(posed, method, init=X)
+        assert solution.status == Status.CONVERGED
+        np.testing.assert_allclose(solution.T_world_i, poses(best.x, d, X), atol=1e-5)
+        if objective == "chordal":
+            value = chordal_objective(posed, solution.T_world_i)
+            np.testing.assert_allclose(value, 2 * best.cost, rtol=1e-8)
+
+
+def test_a_kernel_ends_at_its_own_minimum_and_names_wrong_edges():
+    graph = problem(3, outliers=0.2)
+    X, edges, T, weight, information, bad = graph
+    with jax.enable_x64(True):
+        posed = PoseGraph.from_edges(edges, T, N, weight, information)
+        method = PoseGraphLM(kernel=GemanMcClure(), tolerance=1e-13, max_steps=200)
+        solution = average(posed, method, init=X)
+        found = np.asarray(solution.T_world_i)
+
+    def cost(x: np.ndarray) -> float:
+        s = (log_errors(graph, poses(x, 3, found)) ** 2).sum(axis=1)
+        return (s / (1 + s / 9.0)).sum()
+
+    steps = 1e-4 * np.eye(6 * (N - 1))
+    slope = np.array([cost(h) - cost(-h) for h in steps]) / 2e-4
+    bend = np.array([cost(h) + cost(-h) - 2 * cost(0 * h) for h in steps]) / 1e-8
+    assert (bend > 0).all()
+    np.testing.assert_allclose(slope / bend, 0, atol=1e-5)
+    trust = np.asarray(solution.edge_weight)
+    assert trust[bad].max() < trust[~bad].min()
+
+
+def test_single_precision_from_the_motions_alone():
+    X, edges, T, *_ = random_graph(N, H, 0.0, 1, noise=0.0)
+    graph = PoseGraph.from_edges(edges, T.astype(np.float32), N)
+    solution = average(graph, PoseGraphLM())
+    assert solution.status == Status.CONVERGED
+    assert solution.T_world_i.dtype == jnp.float32
+    np.testing.assert_allclose(solution.T_world_i, X, atol=1e-4)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "optimum"), [("smallGrid3D", 1025.398), ("CSAIL", 31.7037)]
+)
+def test_certified_optima_from_the_motions_alone(name, optimum):
+    with jax.enable_x64(True):
+        graph = read_g2o(data_dir("pose_graphs", f"{name}.g2o"))
+        solution = average(graph, PoseGraphLM(objective="chordal"))
+        assert solution.status == Status.CONVERGED
+        value = chordal_objective(graph, solution.T_world_i)
+    np.testing.assert_allclose(value, optimum, rtol=1e-5)
