@@ -22,8 +22,8 @@ with as many threads or processes as there are cores.
 """
 
 import argparse
+import dataclasses
 import os
-import re
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -37,7 +37,6 @@ from typing import Any
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import equinox as eqx  # noqa: E402
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
@@ -59,16 +58,26 @@ def own_solve(method: Any, source: np.ndarray, target: np.ndarray, _: float):
     return np.asarray(solution.T_target_source)
 
 
+def written_out(part: Any) -> str:
+    """A method object with all its settings, on one line."""
+    if isinstance(part, type):
+        return part.__name__
+    if not dataclasses.is_dataclass(part):
+        return f"{part:.3g}" if isinstance(part, jax.Array) else str(part)
+    settings = [
+        f"{field.name}={written_out(getattr(part, field.name))}"
+        for field in dataclasses.fields(part)
+    ]
+    return f"{type(part).__name__}({', '.join(settings)})"
+
+
 def own_methods() -> list[Method]:
     """The rows of this package."""
     methods = {"jaxreg ICP": jr.ICP()}
-    rows = []
-    for name, method in methods.items():
-        note = eqx.tree_pformat(method, short_arrays=False, hide_defaults=False)
-        note = re.sub(r"\s+", " ", note)
-        note = re.sub(r"Array\((\S+?),[^)]*\)", r"\1", note)
-        rows.append(Method(name, note, partial(own_solve, method)))
-    return rows
+    return [
+        Method(name, written_out(method), partial(own_solve, method))
+        for name, method in methods.items()
+    ]
 
 
 def run_size(
@@ -191,7 +200,8 @@ def batch_calls(
         return poses
 
     for peer in peers():
-        if peer.solve is None or not any(x in peer.name for x in names):
+        fits = peer.smallest <= BATCH_POINTS and any(x in peer.name for x in names)
+        if peer.solve is None or not fits:
             continue
         calls[f"{peer.name}, {cores} processes"] = partial(in_processes, peer.name)
         if isinstance(peer.solve, partial) and peer.solve.func is small_gicp:
