@@ -189,7 +189,8 @@ def batch_calls(
     for method in own_methods():
         solve = method.solve
         assert solve is not None
-        calls[f"{method.name}, one batch"] = partial(solve, sources, targets, 0.0)
+        if any(x in method.name for x in names):
+            calls[f"{method.name}, one batch"] = partial(solve, sources, targets, 0.0)
 
     def in_processes(name: str) -> np.ndarray:
         parts = [both[at::cores] for at in range(cores)]
@@ -218,7 +219,7 @@ def run_batch(shape: Shape, names: list[str], repeats: int) -> list[dict]:
     rows: list[dict] = [
         {"name": peer.name, "failed": peer.parameters}
         for peer in peers()
-        if peer.solve is None
+        if peer.solve is None and any(x in peer.name for x in names)
     ]
     with ProcessPoolExecutor(
         timing.num_cores(), mp_context=get_context("spawn")
@@ -302,7 +303,7 @@ def main() -> None:
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         print("compilation cache on: first calls may find compiled code")
     if options.batch:
-        names = options.only or ["PLANE", "GICP", "plane"]
+        names = options.only or ["jaxreg", "PLANE", "GICP", "plane"]
         rows = run_batch(shape, names, max(options.repeats, 5))
         batch_table(rows)
         timing.keep(rows, machine, options.json)
