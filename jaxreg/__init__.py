@@ -47,6 +47,7 @@ from jaxreg import robust as robust
 from jaxreg._core.status import Status as Status
 from jaxreg.averaging import AveragingSolution as AveragingSolution
 from jaxreg.averaging import Correntropy as Correntropy
+from jaxreg.averaging import LowRankSparse as LowRankSparse
 from jaxreg.averaging import MotionAveraging as MotionAveraging
 from jaxreg.averaging import PoseGraphLM as PoseGraphLM
 from jaxreg.averaging import SpanningTree as SpanningTree
