@@ -3,7 +3,8 @@
 Build once from the target points, then query any number of times:
 
     index = VoxelTable.build(target, mask)
-    found = index.query(points)      # Neighbours(index, sq_distance, valid)
+    found = index.query(points)         # Neighbours(index, sq_distance, valid): (n,)
+    found = index.query(points, k=5)    # the five closest, ascending: (n, 5)
 
 An index is a pytree: it passes through `jit` and `vmap`. Which target is closest
 carries no gradient; the squared distance is differentiable in queries and targets.
@@ -17,21 +18,23 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.typing import Mask, Points
+from jaxreg._core.typing import Mask, Points, Scalar
 
 
 class Neighbours(eqx.Module):
-    """The closest target point of each query.
+    """The closest target points of each query: `(n,)`, or `(n, k)` for k > 1.
 
     Attributes:
-        index: `(n,)` int32 row in the target.
-        sq_distance: `(n,)` squared distance to it, in the target's unit squared.
-        valid: `(n,)` False where there is no valid target point at all.
+        index: int32 row in the target; 0 where there are too few valid targets.
+        sq_distance: squared distance to it, in the target's unit squared. Ascending
+            along k, up to rounding; inf where there are fewer than k valid targets.
+        valid: False where there are too few valid targets, where the point found is
+            farther than the radius, and where the query is not finite.
     """
 
-    index: Int[Array, " n"]
-    sq_distance: Float[Array, " n"]
-    valid: Bool[Array, " n"]
+    index: Int[Array, " n *k"]
+    sq_distance: Float[Array, " n *k"]
+    valid: Bool[Array, " n *k"]
 
 
 class AbstractIndex(eqx.Module):
@@ -47,11 +50,43 @@ class AbstractIndex(eqx.Module):
 
     @abc.abstractmethod
     def lookup(self, columns: Float[Array, "d n"]) -> Int[Array, " n"]:
-        """The row of the closest valid target of each query, given as `(d, n)`."""
+        """The row of the closest valid target of each query, given as `(d, n)`.
 
-    def query(self, points: Points) -> Neighbours:
-        """The closest valid target point of each of `(n, d)` finite points."""
-        index = self.lookup(points.T)
+        Any row where no target is valid or the query is not finite.
+        """
+
+    def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
+        """The rows of the k closest valid targets, nearest first; -1 for surplus."""
+        raise ValueError(
+            f"{type(self).__name__} finds the closest point only (k=1), not k={k}; "
+            "BruteForce takes any k"
+        )
+
+    def query(
+        self, points: Points, k: int = 1, radius: Scalar | float | None = None
+    ) -> Neighbours:
+        """The k closest valid target points of each query.
+
+        Args:
+            points: `(n, d)` queries.
+            k: static. The result has shapes `(n,)` for k = 1 and `(n, k)` for more.
+            radius: farther targets are flagged invalid, in the unit of the points.
+
+        Raises:
+            ValueError: if k < 1, or more than this index can find.
+        """
+        if k < 1:
+            raise ValueError(f"k must be at least 1, got k={k}")
+        if k == 1:
+            index = self.lookup(points.T)
+            found = jnp.broadcast_to(jnp.any(self.mask), index.shape)
+        else:
+            index = self.lookup_nearest(points.T, k).T
+            index, found = jnp.maximum(index, 0), index >= 0
+            points = points[:, None]
         delta = points - self.points[index]
-        valid = jnp.broadcast_to(jnp.any(self.mask), index.shape)
-        return Neighbours(index, jnp.sum(delta * delta, axis=-1), valid)
+        sq = jnp.sum(delta * delta, axis=-1)
+        valid = found & jnp.all(jnp.isfinite(points), axis=-1)
+        if radius is not None:
+            valid = valid & (sq <= jnp.asarray(radius, sq.dtype) ** 2)
+        return Neighbours(index, jnp.where(found, sq, jnp.inf) if k > 1 else sq, valid)
