@@ -5,6 +5,7 @@ from jaxreg.averaging.base import AbstractAverager as AbstractAverager
 from jaxreg.averaging.base import AveragingSolution as AveragingSolution
 from jaxreg.averaging.consensus import CycleConsensus as CycleConsensus
 from jaxreg.averaging.correntropy import Correntropy as Correntropy
+from jaxreg.averaging.covariance import pose_covariances as pose_covariances
 from jaxreg.averaging.lowrank import LowRankSparse as LowRankSparse
 from jaxreg.averaging.plain import MotionAveraging as MotionAveraging
 from jaxreg.averaging.plain import WeightedMotionAveraging as WeightedMotionAveraging

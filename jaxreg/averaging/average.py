@@ -75,7 +75,8 @@ def _average(
 ) -> AveragingSolution:
     dtype, d = graph.T_i_j.dtype, graph.dim
     method = cast_floats(method, dtype)
-    reduced, placed, finite = _reduce(graph)
+    reduced, component, finite = _reduce(graph)
+    placed = component == component[0]
     T_start = None
     T_world_0 = jnp.eye(d + 1, dtype=dtype)
     if init is not None:
@@ -93,12 +94,17 @@ def _average(
     status = jnp.where(jnp.all(placed), out.status, Status.DISCONNECTED)
     status = jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)
     return eqx.tree_at(
-        lambda s: (s.T_world_i, s.placed, s.status), out, (T_world_i, placed, status)
+        lambda s: (s.T_world_i, s.placed, s.component, s.status),
+        out,
+        (T_world_i, placed, component, status),
     )
 
 
 def _reduce(graph: PoseGraph) -> tuple[PoseGraph, Array, Array]:
-    """The graph without edges that are masked, not finite, or not joined to frame 0."""
+    """The graph without edges that are masked, not finite, or not joined to frame 0.
+
+    Also the component of each frame, and whether all numbers were finite.
+    """
     finite = jnp.all(jnp.isfinite(graph.T_i_j), axis=(1, 2)) & (
         jnp.isfinite(graph.weight) & (graph.weight >= 0)
     )
@@ -117,4 +123,4 @@ def _reduce(graph: PoseGraph) -> tuple[PoseGraph, Array, Array]:
         information=None if info is None else jnp.where(used[:, None, None], info, 0),
         num_poses=graph.num_poses,
     )
-    return reduced, placed, jnp.all(finite | ~graph.mask)
+    return reduced, component, jnp.all(finite | ~graph.mask)

@@ -22,8 +22,11 @@ class AveragingSolution(eqx.Module):
             of frames that are not placed are the identity and mean nothing.
         edge_weight: `(e,)` how much the method trusts each edge, from 0 to 1, without
             the prior weight; 0 where masked.
+        agreement: the share, by prior weight, of the edges that the method trusts by
+            more than a half, among those that are joined to frame 0.
         status: int32, see `jaxreg.Status`.
         placed: `(v,)` True for frames joined to frame 0 by edges of positive weight.
+        component: `(v,)` int32, the smallest frame of the component of each frame.
         kernel_width: `(2,)` final width of the correntropy kernel for translation
             (unit of the input) and rotation (radians); inf for methods without one.
         num_steps: int32, steps taken.
@@ -35,8 +38,10 @@ class AveragingSolution(eqx.Module):
 
     T_world_i: Float[Array, "v D D"]
     edge_weight: Float[Array, " e"]
+    agreement: Float[Array, ""]
     status: StatusArray
     placed: Bool[Array, " v"]
+    component: Int[Array, " v"]
     kernel_width: Float[Array, "2"]
     num_steps: Int[Array, ""]
     residual: Float[Array, ""]
@@ -47,9 +52,11 @@ class AveragingSolution(eqx.Module):
             return f"AveragingSolution(T_world_i {self.T_world_i.shape})"
         status = Status(int(self.status)).name
         trusted = int(jnp.sum(self.edge_weight > 0.5))
+        parts = int(jnp.unique(self.component).shape[0])
+        apart = f" ({parts} components)" if parts > 1 else ""
         return (
             f"AveragingSolution({status}: {int(jnp.sum(self.placed))} of "
-            f"{self.placed.shape[0]} poses placed, {trusted} of "
+            f"{self.placed.shape[0]} poses placed{apart}, {trusted} of "
             f"{self.edge_weight.shape[0]} edges trusted,\n"
             f"    residual {float(self.residual):.4g}, {int(self.num_steps)} steps)"
         )
@@ -130,11 +137,14 @@ def solution(
     trust = jnp.ones(graph.weight.shape, dtype) if edge_weight is None else edge_weight
     done = jnp.asarray(True) if converged is None else converged
     width = jnp.full((2,), jnp.inf, dtype) if kernel_width is None else kernel_width
+    trust = jnp.where(graph.mask & (graph.weight > 0), trust, 0)
     return AveragingSolution(
         T_world_i=T_world_i,
-        edge_weight=jnp.where(graph.mask & (graph.weight > 0), trust, 0),
+        edge_weight=trust,
+        agreement=weighted_mean((trust > 0.5).astype(dtype), graph.weight),
         status=jnp.where(done, Status.CONVERGED, Status.MAX_STEPS).astype(jnp.int32),
         placed=jnp.ones(T_world_i.shape[:1], dtype=bool),
+        component=jnp.zeros(T_world_i.shape[:1], dtype=jnp.int32),
         kernel_width=width,
         num_steps=jnp.asarray(num_steps, jnp.int32),
         residual=weighted_mean(frobenius(graph, T_world_i, scale), graph.weight),

@@ -14,7 +14,7 @@ from jaxreg.averaging.base import (
     length_scale,
     solution,
 )
-from jaxreg.averaging.cycles import edge_log_odds
+from jaxreg.averaging.cycles import edge_log_odds, judged
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -69,7 +69,8 @@ class CycleConsensus(AbstractAverager):
         start = _Search(
             T=first,
             score=jnp.maximum(score, tree_score),
-            settled=_is_settled(graph, odds, first, scale),
+            # Without cycles there is no belief to draw hypotheses by.
+            settled=_is_settled(graph, odds, first, scale) | (not judged(graph)),
             round=jnp.asarray(0, jnp.int32),
             key=jax.random.key(0) if key is None else key,
         )
@@ -127,6 +128,23 @@ def agreement(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     total = jnp.zeros((), sq.dtype)
     for width in _SCALES:
         total = total + jnp.sum(graph.weight * jnp.exp(-sq / (2 * width**2)))
+    return total
+
+
+def redundancy(graph: PoseGraph, T_world_i: Array) -> Array:
+    """Edges that agree beyond those that any tree agrees with, over the same ladder.
+
+    A chain of motions agrees with its own edges, however far it drifts.
+    """
+    rotation, translation = graph.differences(T_world_i)
+    sq = rotation / 2 + translation / length_scale(graph) ** 2
+    present = graph.weight > 0
+    usual = jnp.sum(graph.weight) / jnp.maximum(jnp.sum(present), 1)
+    free = (graph.num_poses - 1) * usual
+    total = jnp.zeros((), sq.dtype)
+    for width in _SCALES:
+        agreed = jnp.sum(graph.weight * jnp.exp(-sq / (2 * width**2)))
+        total = total + jnp.maximum(agreed - free, 0)
     return total
 
 

@@ -21,8 +21,9 @@ from jaxreg.averaging.base import (
     solution,
     weighted_mean,
 )
-from jaxreg.averaging.consensus import CycleConsensus, agreement
+from jaxreg.averaging.consensus import CycleConsensus, redundancy
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, gauss_newton_step
+from jaxreg.averaging.graduated import graduated
 from jaxreg.averaging.iterate import (
     Iterated,
     averaging_gradients,
@@ -121,8 +122,9 @@ class Correntropy(AbstractAverager):
 
     def _annealed(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
         rows = scaled_rows(self.rows)
-        finish = graph.num_poses <= DENSE_LIMIT
         T_start = _better_start(graph, T_start, rows)
+        if graph.num_poses > DENSE_LIMIT:
+            return graduated(graph, T_start, self.max_steps)
         end = iterate(
             graph,
             T_start,
@@ -132,10 +134,8 @@ class Correntropy(AbstractAverager):
             averaging_step(rows),
             max_steps=self.max_steps,
             # Gauss-Newton does the last digits better.
-            tolerance=1e-2 if finish else self.tolerance,
+            tolerance=1e-2,
         )
-        if not finish:
-            return averaging_gradients(graph, end, gaussian_trust, rows)
         last = iterate(
             graph,
             end.T_world_i,
@@ -160,6 +160,5 @@ def _better_start(
     it agrees with few, and the start stands.
     """
     plain = iterate_plain(graph, T_start, rows, max_steps=5, tolerance=1e-2)
-    scale = length_scale(graph)
-    better = agreement(graph, plain.T_world_i, scale) > agreement(graph, T_start, scale)
+    better = redundancy(graph, plain.T_world_i) > redundancy(graph, T_start)
     return jnp.where(better, plain.T_world_i, T_start)

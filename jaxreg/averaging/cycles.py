@@ -26,6 +26,11 @@ CYCLE_LIMIT = 1_000_000
 _PRIOR, _NEUTRAL, _POWER, _CAP, _ROUNDS = 0.4, 0.3, 4, 1e4, 6
 
 
+def judged(graph: PoseGraph) -> bool:
+    """Whether the graph is small enough for `edge_log_odds` to look at its cycles."""
+    return graph.num_edges * graph.num_poses <= CYCLE_LIMIT
+
+
 def edge_log_odds(graph: PoseGraph) -> Float[Array, " e"]:
     """The logarithm of the odds that each edge is right, judged by its 3-cycles.
 
@@ -41,7 +46,7 @@ def edge_log_odds(graph: PoseGraph) -> Float[Array, " e"]:
     usual = jnp.sum(graph.weight) / jnp.maximum(jnp.sum(present), 1)
     relative = jnp.where(present, graph.weight / jnp.where(usual > 0, usual, 1), 1)
     prior = jnp.log(relative * (_PRIOR / (1 - _PRIOR)))
-    if graph.num_edges * graph.num_poses > CYCLE_LIMIT:
+    if not judged(graph):
         return jnp.where(present, prior, -jnp.inf)
     ratio, via_i, via_j = _cycles(graph)
 

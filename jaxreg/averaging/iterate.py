@@ -97,9 +97,9 @@ def iterate(
     """Alternates weights and steps until widths and poses stand still.
 
     Stops when no rotation moves by more than `tolerance` radians, no position by more
-    than `tolerance` of the size of the scene, and no width by more than a thousandth
-    and its shrinking, or after `max_steps`. Nothing is differentiable here; the caller
-    attaches the derivatives of the fixed point.
+    than `tolerance` of the size of the scene, and no width shrinks by more than
+    a thousandth of itself, or after `max_steps`. Nothing is differentiable here; the
+    caller attaches the derivatives of the fixed point.
     """
     graph, T_start, width_start, tolerance = jax.lax.stop_gradient(
         (graph, T_start, width_start, tolerance)

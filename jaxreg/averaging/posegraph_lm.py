@@ -12,25 +12,23 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
+from jaxreg.averaging.block_system import block_inverse, solve_block_flow
 from jaxreg.averaging.iterate import nearby_rotation
-from jaxreg.averaging.krylov import conjugate_gradients
-from jaxreg.averaging.laplacian import divergence
 from jaxreg.averaging.plain import MotionAveraging
 from jaxreg.averaging.tree import start
-from jaxreg.averaging.two_level import TwoLevel, two_level
+from jaxreg.averaging.two_level import TwoLevel
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
 from jaxreg.robust import AbstractKernel
 
 
-# Unknowns below which the preconditioner is exact, in one of its blocks, and at most in
-# its coarse system; steps after which it is built anew.
-_EXACT, _BLOCK, _COARSE, _STALE = 384, 96, 1500, 60
+# Rounds of conjugate gradients after which their preconditioner is built anew.
+_STALE = 60
 
 
 class PoseGraphLM(AbstractAverager):
@@ -80,48 +78,27 @@ class PoseGraphLM(AbstractAverager):
         graph, self = jax.lax.stop_gradient((graph, self))
         T_start = jax.lax.stop_gradient(start(self.initialiser, graph, init, key))
         problem = self._problem(graph)
-        cost = problem.cost(T_start)
-        limit = jnp.maximum(self.tolerance, 4 * jnp.finfo(cost.dtype).eps)
-        damping = jnp.asarray(1e-7, cost.dtype)
-        begin = _State(
-            T=T_start,
-            cost=cost,
-            damping=damping,
-            inverse=_inverse(graph, problem.normal(T_start)[0], damping),
-            gain=jnp.asarray(jnp.inf, cost.dtype),
-            step=jnp.asarray(0, jnp.int32),
-        )
-        end = jax.lax.while_loop(
-            lambda s: (s.gain > limit) & (s.step < self.max_steps),
-            lambda s: _try_step(problem, s),
-            begin,
-        )
+        end = minimise(problem, T_start, self.max_steps, self.tolerance)
         return solution(
             graph,
             end.T,
             edge_weight=problem.trust(problem.squares(end.T)),
-            converged=end.gain <= limit,
+            converged=end.converged,
             num_steps=end.step,
         )
 
-    def _problem(self, graph: PoseGraph) -> "_Problem":
+    def _problem(self, graph: PoseGraph) -> "Problem":
         if self.objective == "chordal":
             error, precision = _chordal_error, _chordal_precision(graph)
         else:
-            error, precision = _log_error, _log_precision(graph)
+            error, precision = log_error, _log_precision(graph)
         if self.kernel is None:
-            return _Problem(graph, error, precision, lambda s: s, jnp.ones_like)
-        kernel, width = self.kernel, jnp.asarray(self.kernel_width)
-        return _Problem(
-            graph,
-            error,
-            precision,
-            lambda s: 2 * kernel.rho(s, width),
-            lambda s: kernel.weight(s, width),
-        )
+            return Problem(graph, error, precision, lambda s: s, jnp.ones_like)
+        width = jnp.asarray(self.kernel_width)
+        return robust_problem(graph, error, precision, self.kernel, width)
 
 
-class _Problem(NamedTuple):
+class Problem(NamedTuple):
     """The sum of loss(r' Omega r) over the edges; trust is its derivative."""
 
     graph: PoseGraph
@@ -158,6 +135,58 @@ class _Problem(NamedTuple):
         return Q, jnp.sum(WJ * r[:, :, None], axis=-2)
 
 
+def robust_problem(
+    graph: PoseGraph,
+    error: Callable[[Array, Array], Array],
+    precision: Float[Array, "e m m"],
+    kernel: AbstractKernel,
+    width: Float[Array, ""],
+) -> Problem:
+    """The problem under a robust kernel of sqrt(r' Omega r)."""
+    return Problem(
+        graph,
+        error,
+        precision,
+        lambda s: 2 * kernel.rho(s, width),
+        lambda s: kernel.weight(s, width),
+    )
+
+
+class Minimum(NamedTuple):
+    """Where Levenberg-Marquardt stopped."""
+
+    T: Float[Array, "v D D"]
+    converged: Bool[Array, ""]
+    step: Int[Array, ""]
+
+
+def minimise(
+    problem: Problem,
+    T_start: Float[Array, "v D D"],
+    max_steps: int,
+    tolerance: Array | float,
+) -> Minimum:
+    """Steps until one lowers the objective by less than a share of `tolerance`."""
+    graph, cost = problem.graph, problem.cost(T_start)
+    limit = jnp.maximum(tolerance, 4 * jnp.finfo(cost.dtype).eps)
+    damping = jnp.asarray(1e-7, cost.dtype)
+    Q = problem.normal(T_start)[0]
+    begin = _State(
+        T=T_start,
+        cost=cost,
+        damping=damping,
+        inverse=block_inverse(graph.edges, Q, graph.num_poses, damping),
+        gain=jnp.asarray(jnp.inf, cost.dtype),
+        step=jnp.asarray(0, jnp.int32),
+    )
+    end = jax.lax.while_loop(
+        lambda s: (s.gain > limit) & (s.step < max_steps),
+        lambda s: _try_step(problem, s),
+        begin,
+    )
+    return Minimum(end.T, end.gain <= limit, end.step)
+
+
 class _State(NamedTuple):
     T: Array
     cost: Array
@@ -178,7 +207,8 @@ def _generators(T: Array) -> Array:
     return jnp.moveaxis(jax.jacfwd(lie.exp)(zero), -1, 0)
 
 
-def _log_error(predicted: Array, T_i_j: Array) -> Array:
+def log_error(predicted: Array, T_i_j: Array) -> Array:
+    """The tangent error of g2o and GTSAM."""
     return lie.log(product(lie.inverse(T_i_j), predicted))
 
 
@@ -203,10 +233,13 @@ def _chordal_precision(graph: PoseGraph) -> Array:
     return jax.vmap(jnp.diag)(jnp.concatenate(parts, axis=1))
 
 
-def _try_step(problem: _Problem, s: _State) -> _State:
+def _try_step(problem: Problem, s: _State) -> _State:
     """One damped step, kept if it lowers the cost."""
     Q, force = problem.normal(s.T)
-    x, rounds = _solve_step(problem.graph, Q, force, s)
+    graph = problem.graph
+    x, rounds = solve_block_flow(
+        graph.edges, Q, force, s.inverse, s.damping, tolerance=1e-2
+    )
     T = nearby_rotation(product(lie.exp(x), s.T))
     cost = problem.cost(T)
     better = cost <= s.cost
@@ -216,7 +249,7 @@ def _try_step(problem: _Problem, s: _State) -> _State:
     damping = jnp.where(better, jnp.maximum(s.damping / 10, 1e-9), s.damping * 30)
     inverse = jax.lax.cond(
         rounds > _STALE,
-        lambda: _inverse(problem.graph, Q, damping),
+        lambda: block_inverse(graph.edges, Q, graph.num_poses, damping),
         lambda: s.inverse,
     )
     return _State(
@@ -226,41 +259,4 @@ def _try_step(problem: _Problem, s: _State) -> _State:
         inverse=inverse,
         gain=jnp.where(better, gain, refused).astype(cost.dtype),
         step=s.step + 1,
-    )
-
-
-def _inverse(graph: PoseGraph, Q: Array, damping: Array) -> TwoLevel:
-    """About (H + damping diag(H))^-1, H = B' Q B, frame 0 held."""
-    num, k = graph.num_poses, Q.shape[-1]
-    block = max(_BLOCK // k, -(-num * k // _COARSE))
-    block = num if num * k <= _EXACT else block
-    return two_level(graph.edges, Q, num, block, damping * _diagonal(graph, Q))
-
-
-def _diagonal(graph: PoseGraph, Q: Array) -> Array:
-    i, j = graph.edges[:, 0], graph.edges[:, 1]
-    zero = jnp.zeros((graph.num_poses, *Q.shape[1:]), Q.dtype)
-    return zero.at[i].add(Q).at[j].add(Q)
-
-
-def _solve_step(
-    graph: PoseGraph, Q: Array, force: Array, s: _State
-) -> tuple[Array, Array]:
-    """-(H + damping diag(H))^-1 B' force with x_0 = 0, and the rounds it took."""
-    num = graph.num_poses
-    i, j = graph.edges[:, 0], graph.edges[:, 1]
-    extra = s.damping * _diagonal(graph, Q)
-
-    def apply(x: Array) -> Array:
-        flow = jnp.sum(Q * (x[j] - x[i])[:, None, :], axis=-1)
-        own = jnp.sum(extra * x[:, None, :], axis=-1)
-        return (divergence(graph.edges, flow, num) + own).at[0].set(0)
-
-    return conjugate_gradients(
-        apply,
-        lambda r: s.inverse(r[..., None])[..., 0],
-        -divergence(graph.edges, force, num).at[0].set(0),
-        columns=False,
-        tolerance=1e-2,
-        max_steps=300,
     )

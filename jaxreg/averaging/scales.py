@@ -10,6 +10,10 @@ from jaxreg.graph.pose_graph import PoseGraph
 # The kernel is three standard deviations of the noise wide: right edges lose little
 # (the mean is 2 % worse than with the inliers known), wrong ones most.
 _DEVIATIONS = 3.0
+# Edges with more trust than this are inside.
+_INSIDE = 0.05
+#: Medians of chi-squared laws by their degrees of freedom.
+CHI2_MEDIAN = {1: 0.4549, 2: 1.3863, 3: 2.3660, 6: 5.3481}
 _NARROWEST_STEP = 0.5
 _WIDEST_START = 0.3
 
@@ -55,13 +59,22 @@ def annealed_width(
     trust = gaussian_trust(graph, T_world_i, width)
     w = graph.weight * trust
     total = jnp.maximum(jnp.sum(w), jnp.finfo(w.dtype).tiny)
-    dof = d * (d - 1) / 2
+    dof = d * (d - 1) // 2
     v = jnp.stack([jnp.sum(w * translation) / d, jnp.sum(w * rotation) / (2 * dof)])
     v = v / total
     ratio = jnp.minimum(v / width**2, 0.9)
     count = jnp.sum(jnp.where(graph.weight > 0, trust, 0))
     spare = jnp.maximum(count - (graph.num_poses - 1), 0.25 * count)
-    variance = ratio / (1 - ratio) * width**2 * count / jnp.maximum(spare, 1e-3)
+    variance = ratio / (1 - ratio) * width**2
+    # Noise of many scales would draw the mean to the finest; the median stands.
+    inside = (graph.weight > 0) & (trust > _INSIDE)
+    middle = jnp.stack(
+        [
+            masked_quantile(translation, inside, 0.5) / CHI2_MEDIAN[d],
+            masked_quantile(rotation, inside, 0.5) / (2 * CHI2_MEDIAN[dof]),
+        ]
+    )
+    variance = jnp.maximum(variance, middle) * count / jnp.maximum(spare, 1e-3)
     floor = (
         64
         * jnp.finfo(w.dtype).eps
