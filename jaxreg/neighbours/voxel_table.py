@@ -1,42 +1,53 @@
 """Approximate closest points from a table: one look-up a query, whatever the target.
 
 A cubic grid over the target's bounding box and a margin around it stores in every cell
-the target point closest to the cell's centre. The table is filled by a feature
-transform: cells that hold points start with the one nearest to their centre, and
-candidates then spread by a forward and a backward sweep along each axis, twice.
+the K target points closest to the cell's centre, found by a feature transform. A query
+is answered with the nearest of its cell's K candidates; outside the grid, with those of
+the nearest cell, and its true distance to the point found.
 
-Error: where the stored point is the closest one to the centre c of the query's cell,
-the distance found exceeds the true one by at most 2 |q - c|, one cell diagonal. A
-query outside the grid is answered from the nearest cell, with its true distance to the
-point found.
+Error: let c be the centre of the cell that answers the query q, r_1 the distance from c
+to its first candidate, R that to the closest point which is not a candidate. The
+distance found exceeds the true one by at most
+
+    max(0, 2 |q - c| - (R - r_1)),
+
+because either the closest point is a candidate, or it is at least R - |q - c| away. For
+the K closest points R is at least r_1, so the excess is at most 2 |q - c|, inside the
+grid one cell diagonal, and falls as K grows; where every valid point is a candidate,
+the answer is exact. The transform misses a closer point in some cells, by tenths of a
+cell and rarely more than one (R < r_1); the bound above holds there too.
+
+On the bench's surface in 64^3 cells, queries near the surface, with K = 1 / 2 / 4 / 8:
+mean excess 0.06 / 0.005 / 0 / 0 cells at 1,000 targets, 0.19 / 0.10 / 0.03 / 0.001 at
+10,000, 0.25 / 0.20 / 0.15 / 0.09 at 100,000; exact answers 82 / 98 / 100 / 100 %,
+33 / 55 / 83 / 99 % and 6 / 11 / 19 / 34 %.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Mask, Points
 from jaxreg.neighbours.base import AbstractIndex
-
-
-_SWEEPS = 2
+from jaxreg.neighbours.feature_transform import feature_transform, smallest
 
 
 class VoxelTable(AbstractIndex):
-    """The closest point to the centre of each cell of a grid.
+    """The closest points to the centre of each cell of a grid.
 
-    About 90 million queries a second on one core of a CPU; the early iterations of
-    every search run on it.
+    The early iterations of every search run on it: with one candidate a cell, one core
+    of a CPU answers some 300 million queries a second; with eight, some 40 million.
     """
 
     points: Float[Array, "m d"]
     mask: Bool[Array, " m"]
-    table: Int[Array, " cells"]
+    table: Int[Array, " entries"]
+    coordinates: Float[Array, "cells kd"] | None
     origin: Float[Array, " d"]
     cell: Float[Array, ""]
     resolution: int = eqx.field(static=True)
+    candidates: int = eqx.field(static=True)
 
     @classmethod
     def build(
@@ -46,38 +57,96 @@ class VoxelTable(AbstractIndex):
         *,
         resolution: int | None = None,
         margin: float = 0.1,
+        candidates: int = 1,
     ) -> "VoxelTable":
         """Fills the table.
 
         Args:
             points: `(m, d)` target points.
-            mask: `(m,)` True for valid points.
+            mask: `(m,)` True for valid points; those that are not finite are not.
             resolution: cells along each axis, 512 in 2D and 64 in 3D by default; the
                 table holds resolution^d integers, 1 MB in either case.
             margin: the grid reaches beyond the longest side of the bounding box by
                 this share of it on every side.
+            candidates: K. For K > 1 the table also holds the candidates' coordinates,
+                K (d + 1) MB in all, which answers twice as fast as fetching them.
+
+        Raises:
+            ValueError: if `candidates` or `resolution` is less than 1.
         """
+        d = points.shape[1]
         if resolution is None:
-            resolution = 512 if points.shape[1] == 2 else 64
-        if mask is None:
-            mask = jnp.ones(points.shape[:1], dtype=bool)
-        inf = jnp.asarray(jnp.inf, points.dtype)
-        low = jnp.min(jnp.where(mask[:, None], points, inf), axis=0)
-        high = jnp.max(jnp.where(mask[:, None], points, -inf), axis=0)
-        filled = jnp.any(mask)
-        low, high = jnp.where(filled, low, 0), jnp.where(filled, high, 1)
-        side = jnp.max(high - low)
-        side = jnp.where(side > 0, side, 1) * (1 + 2 * margin)
-        cell = side / resolution
-        origin = (low + high) / 2 - side / 2
-        table = _feature_transform(
-            lax.stop_gradient(points), mask, origin, cell, resolution
+            resolution = 512 if d == 2 else 64
+        if candidates < 1 or resolution < 1:
+            raise ValueError(
+                "candidates and resolution must be at least 1, got "
+                f"candidates={candidates}, resolution={resolution}"
+            )
+        finite = jnp.all(jnp.isfinite(points), axis=1)
+        mask = finite if mask is None else mask & finite
+        frozen = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
+        origin, cell = _grid(frozen, mask, resolution, margin)
+        home = _cell_of(frozen.T, origin, cell, resolution)
+        # In units of cells: safe in float32.
+        rows = feature_transform(
+            (frozen - origin) / cell, mask, home, resolution, candidates
         )
-        return cls(points, mask, table, origin, cell, resolution)
+        if candidates == 1:
+            table, coordinates = jnp.maximum(rows[0], 0), None
+        else:
+            near = jnp.where((rows >= 0)[..., None], frozen[rows], jnp.inf)
+            coordinates = jnp.moveaxis(near, 0, 2).reshape(-1, d * candidates)
+            table = rows.T.reshape(-1)
+        return cls(
+            points, mask, table, coordinates, origin, cell, resolution, candidates
+        )
 
     def lookup(self, columns: Float[Array, "d n"]) -> Int[Array, " n"]:
-        """The stored candidate of each query's cell."""
-        return self.table[_cell_of(columns, self.origin, self.cell, self.resolution)]
+        """The nearest of the candidates of each query's cell."""
+        home = _cell_of(columns, self.origin, self.cell, self.resolution)
+        if self.coordinates is None:
+            return self.table[home]
+        best = self._sq_distance(columns, home, 0)
+        slot = jnp.zeros(home.shape, jnp.int32)
+        for i in range(1, self.candidates):
+            sq = self._sq_distance(columns, home, i)
+            closer = sq < best
+            slot = jnp.where(closer, i, slot)
+            best = jnp.where(closer, sq, best)
+        return jnp.maximum(self.table[home * self.candidates + slot], 0)
+
+    def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
+        """The k nearest of the candidates of each query's cell; -1 for surplus."""
+        if k > self.candidates:
+            raise ValueError(
+                f"VoxelTable holds {self.candidates} candidates a cell, not k={k}; "
+                f"build it with candidates={k}"
+            )
+        home = _cell_of(columns, self.origin, self.cell, self.resolution)
+        slots = range(self.candidates)
+        sq = jnp.stack([self._sq_distance(columns, home, i) for i in slots])
+        rows = jnp.stack([self.table[home * self.candidates + i] for i in slots])
+        return smallest(sq, rows, k)
+
+    def _sq_distance(self, columns: Array, home: Array, slot: int) -> Array:
+        """Squared distance to one candidate; inf where there is none."""
+        assert self.coordinates is not None
+        sq = jnp.zeros(home.shape, columns.dtype)
+        for axis in range(columns.shape[0]):
+            at = axis * self.candidates + slot
+            sq = sq + (columns[axis] - self.coordinates[home, at]) ** 2
+        return sq
+
+
+def _grid(points: Array, mask: Array, resolution: int, margin: float):
+    """Origin and side of a cell of the cubic grid around the valid points."""
+    low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(mask[:, None], points, -jnp.inf), axis=0)
+    filled = jnp.any(mask)
+    low, high = jnp.where(filled, low, 0), jnp.where(filled, high, 1)
+    side = jnp.max(high - low)
+    side = jnp.where(side > 0, side, 1) * (1 + 2 * margin)
+    return low + (high - low) / 2 - side / 2, side / resolution
 
 
 def _cell_of(columns: Array, origin: Array, cell: Array, resolution: int) -> Array:
@@ -87,51 +156,3 @@ def _cell_of(columns: Array, origin: Array, cell: Array, resolution: int) -> Arr
         at = jnp.clip(at, 0, resolution - 1).astype(jnp.int32)
         flat = flat * resolution + at
     return flat
-
-
-def _feature_transform(
-    points: Array, mask: Array, origin: Array, cell: Array, resolution: int
-) -> Int[Array, " cells"]:
-    m, d = points.shape
-    cells = resolution**d
-    in_cells = (points - origin) / cell  # work in units of cells: safe in float32
-    home = _cell_of(points.T, origin, cell, resolution)
-    to_centre = in_cells - jnp.floor(in_cells) - 0.5
-    sq = jnp.where(mask, jnp.sum(to_centre**2, axis=-1), jnp.inf)
-    nearest = jax.ops.segment_min(sq, home, cells)
-    rows = jnp.arange(m, dtype=jnp.int32)
-    winner = mask & (sq <= nearest[home])
-    seed = jax.ops.segment_max(jnp.where(winner, rows, -1), home, cells)
-    table = jnp.maximum(seed, -1).reshape((resolution,) * d).astype(jnp.int32)
-    for _ in range(_SWEEPS):
-        for axis in range(d):
-            table = _sweep(table, in_cells, axis)
-    return jnp.maximum(table, 0).reshape(-1)
-
-
-def _sweep(table: Array, in_cells: Array, axis: int) -> Array:
-    """Carries candidates along one axis, forward then backward."""
-    d, resolution = table.ndim, table.shape[0]
-    others = jnp.meshgrid(
-        *[jnp.arange(resolution, dtype=in_cells.dtype) + 0.5] * (d - 1), indexing="ij"
-    )
-
-    def step(carry: tuple[Array, Array], at: tuple[Array, Array]):
-        coordinate, own = at
-        centre = list(others)
-        centre.insert(axis, jnp.broadcast_to(coordinate, own.shape))
-
-        def sq_to(candidate: Array) -> Array:
-            p = in_cells[candidate]
-            sq = sum((p[..., k] - centre[k]) ** 2 for k in range(d))
-            return jnp.where(candidate >= 0, sq, jnp.inf)
-
-        best = jnp.where(sq_to(own) <= sq_to(carry[0]), own, carry[0])
-        return (best, coordinate), best
-
-    lines = jnp.moveaxis(table, axis, 0)
-    coordinates = jnp.arange(resolution, dtype=in_cells.dtype) + 0.5
-    start = (jnp.full(lines.shape[1:], -1, table.dtype), coordinates[0])
-    lines = lax.scan(step, start, (coordinates, lines))[1]
-    lines = lax.scan(step, start, (coordinates, lines), reverse=True)[1]
-    return jnp.moveaxis(lines, 0, axis)

@@ -1,138 +1,139 @@
-"""Every index against SciPy's k-d tree in float64."""
+"""What every index promises, against NumPy in float64."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial import KDTree
+from clouds import M, N, clouds, compiled, distances, few, kinds, scales, seeds
+from hypothesis import given
 
-from jaxreg.neighbours import BruteForce, VoxelTable
-
-
-M, N = 300, 200
+from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
 
 
-def _shape(kind: str, rng: np.random.Generator, d: int) -> np.ndarray:
-    x = rng.random((M, d))
-    if kind == "clustered":
-        x = x**4
-    elif kind == "duplicated":
-        x = x[rng.integers(0, M // 3, M)]
-    elif kind == "collinear":
-        x = x[:, :1] * np.ones(d)
-    elif kind == "far":
-        x = x + 1e3
-    return x
+EXACT = [BruteForce]
+INDEXES = [*EXACT, VoxelTable]
 
 
-kinds = st.sampled_from(["random", "clustered", "duplicated", "collinear", "far"])
+def _compiled(index):
+    options = {"resolution": 16} if index is VoxelTable else {}
+    return compiled(index, **options)
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_brute_force_is_exact(d):
-    query = jax.jit(lambda p, m, q: BruteForce.build(p, m).query(q))
-
-    @settings(max_examples=25, deadline=None)
-    @given(
-        kind=kinds, seed=st.integers(0, 10**6), scale=st.sampled_from([1e-6, 1, 1e6])
-    )
+@pytest.mark.parametrize("index", EXACT)
+def test_the_closest_point_is_found(index, d):
+    @few
+    @given(kind=kinds, seed=seeds, scale=scales)
     def check(kind, seed, scale):
-        rng = np.random.default_rng(seed)
-        target = (scale * _shape(kind, rng, d)).astype(np.float32)
-        queries = (scale * (_shape(kind, rng, d)[:N] + 0.1)).astype(np.float32)
-        mask = rng.random(M) < 0.7
-        mask[0] = True
-        found = query(target, mask, queries)
-        distance = KDTree(target[mask].astype(float)).query(queries.astype(float))[0]
+        target, mask, queries = clouds(kind, seed, d, scale)
+        found = _compiled(index)(target, mask, queries)
         row = np.asarray(found.index)
         assert mask[row].all()
-        mine = np.linalg.norm(queries.astype(float) - target[row].astype(float), axis=1)
-        # Equal up to the rounding of a squared float32 distance.
-        np.testing.assert_allclose(mine, distance, rtol=1e-6, atol=1e-9 * scale)
+        assert np.asarray(found.valid).all()
+        true = distances(target, mask, queries)
+        mine = true[np.arange(N), row]
+        # Up to the rounding of a squared float32 distance.
+        np.testing.assert_allclose(mine, true.min(1), rtol=1e-6)
+        np.testing.assert_allclose(np.sqrt(found.sq_distance), mine, rtol=1e-6)
 
     check()
 
 
-def test_brute_force_breaks_ties_by_the_lowest_row_and_tiles_large_targets():
-    rng = np.random.default_rng(0)
-    base = rng.random((5000, 3)).astype(np.float32)
-    target = np.concatenate([base, base])  # several tiles, every point twice
-    found = BruteForce.build(jnp.asarray(target)).query(jnp.asarray(base[::7]))
-    np.testing.assert_array_equal(found.index, np.arange(5000)[::7])
-    np.testing.assert_array_equal(found.sq_distance, 0)
-
-
-def test_brute_force_in_float64():
+@pytest.mark.parametrize("index", EXACT)
+def test_the_closest_point_is_found_in_float64(index):
     with jax.enable_x64(True):
-        rng = np.random.default_rng(0)
-        target = 1e6 + rng.random((M, 3))
-        queries = 1e6 + rng.random((N, 3))
-        found = BruteForce.build(jnp.asarray(target)).query(jnp.asarray(queries))
-        np.testing.assert_array_equal(found.index, KDTree(target).query(queries)[1])
+        target, mask, queries = clouds("offset", 0, 3, dtype=np.float64)
+        found = _compiled(index)(target, mask, queries)
+        expected = distances(target, mask, queries).argmin(1)
+        np.testing.assert_array_equal(found.index, expected)
+        assert found.sq_distance.dtype == np.float64
+        assert found.index.dtype == np.int32
 
 
-@pytest.mark.parametrize("d", [2, 3])
-def test_voxel_table_stays_within_its_bound(d):
-    query = jax.jit(lambda p, m, q: (VoxelTable.build(p, m, resolution=32)).query(q))
-
-    @settings(max_examples=20, deadline=None)
-    @given(
-        kind=kinds, seed=st.integers(0, 10**6), scale=st.sampled_from([1e-3, 1, 1e3])
-    )
-    def check(kind, seed, scale):
-        rng = np.random.default_rng(seed)
-        target = (scale * _shape(kind, rng, d)).astype(np.float32)
-        inside = rng.integers(0, M, N)
-        queries = target[inside] + 0.05 * scale * rng.standard_normal((N, d))
-        queries = queries.astype(np.float32)
-        mask = rng.random(M) < 0.7
-        mask[0] = True
-        found = query(target, mask, queries)
-        assert mask[np.asarray(found.index)].all()
-        distance = KDTree(target[mask]).query(queries)[0]
-        low, high = target[mask].min(0), target[mask].max(0)
-        side = max(np.max(high - low), 1e-12) if mask.sum() > 1 else 1
-        side = side if side > 1e-6 * scale else 1
-        cell = 1.2 * side / 32
-        excess = np.sqrt(np.asarray(found.sq_distance)) - distance
-        # One cell diagonal, twice for cells that the sweeps did not settle.
-        outside = np.any((queries < low) | (queries > high), axis=1)
-        assert np.all(excess[~outside] <= 2 * np.sqrt(d) * cell + 1e-6 * scale)
-        assert np.mean(excess[~outside] > np.sqrt(d) * cell) < 0.02
-
-    check()
-
-
-def test_voxel_table_answers_far_queries_with_their_true_distance():
-    rng = np.random.default_rng(0)
-    target = rng.random((M, 3)).astype(np.float32)
-    queries = (100 * rng.standard_normal((N, 3))).astype(np.float32)
-    table = VoxelTable.build(jnp.asarray(target), resolution=32)
-    found = table.query(jnp.asarray(queries))
-    own = np.linalg.norm(queries - target[np.asarray(found.index)], axis=1)
-    np.testing.assert_allclose(np.sqrt(found.sq_distance), own, rtol=1e-5)
-    assert np.max(own - KDTree(target).query(queries)[0]) < np.sqrt(3) * 1.3
-
-
-@pytest.mark.parametrize("index", [BruteForce, VoxelTable])
+@pytest.mark.parametrize("index", INDEXES)
 def test_no_valid_target_is_flagged(index):
-    points = jnp.ones((10, 3))
-    found = index.build(points, jnp.zeros(10, bool)).query(points)
-    assert not found.valid.any()
-    assert np.all(np.asarray(found.index) < 10)
+    target, mask, queries = clouds("random", 0, 3)
+    found = _compiled(index)(target, np.zeros_like(mask), queries)
+    assert not np.asarray(found.valid).any()
+    assert np.all((np.asarray(found.index) >= 0) & (np.asarray(found.index) < M))
+
+
+@pytest.mark.parametrize("index", INDEXES)
+def test_queries_that_are_not_finite_are_flagged_alone(index):
+    target, mask, queries = clouds("random", 0, 3)
+    expected = _compiled(index)(target, mask, queries)
+    broken = queries.copy()
+    broken[3], broken[5, 0], broken[7, 2] = np.nan, np.inf, -np.inf
+    found = _compiled(index)(target, mask, broken)
+    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(found.valid)), [3, 5, 7])
+    others = np.asarray(found.valid)
+    np.testing.assert_array_equal(found.index[others], expected.index[others])
+    assert np.all((np.asarray(found.index) >= 0) & (np.asarray(found.index) < M))
 
 
 @pytest.mark.parametrize("index", [BruteForce, VoxelTable])
+def test_targets_that_are_not_finite_are_never_found(index):
+    target, mask, queries = clouds("random", 0, 3)
+    mask[:] = True
+    broken = target.copy()
+    broken[::2] = np.nan
+    broken[4, 1:], broken[6] = 0, np.inf
+    found = _compiled(index)(broken, mask, queries)
+    mask[::2] = False
+    expected = _compiled(index)(target, mask, queries)
+    np.testing.assert_array_equal(found.index, expected.index)
+
+
+@pytest.mark.parametrize("index", INDEXES)
 def test_vmap_equals_the_loop(index):
-    rng = np.random.default_rng(0)
-    target = jnp.asarray(rng.random((3, 50, 3)), jnp.float32)
-    queries = jnp.asarray(rng.random((3, 40, 3)), jnp.float32)
+    sets = [clouds("random", seed, 3) for seed in range(3)]
+    find = _compiled(index)
+    batched = jax.jit(jax.vmap(find))(*map(np.stack, zip(*sets, strict=True)))
+    for k, one in enumerate(sets):
+        np.testing.assert_array_equal(batched.index[k], find(*one).index)
 
-    def nearest(p, q):
-        return index.build(p).query(q).index
 
-    batched = jax.vmap(nearest)(target, queries)
-    for k in range(3):
-        np.testing.assert_array_equal(batched[k], nearest(target[k], queries[k]))
+@pytest.mark.parametrize("index", INDEXES)
+def test_a_radius_flags_what_is_farther(index):
+    target, mask, queries = clouds("random", 0, 3)
+    for radius in (0.05, 0.1):
+        found = _compiled(index)(target, mask, queries, radius)
+        mine = distances(target, mask, queries)[np.arange(N), np.asarray(found.index)]
+        np.testing.assert_array_equal(found.valid, mine <= radius)
+        assert 0 < np.sum(found.valid) < N
+
+
+def test_squared_distances_have_gradients():
+    target, mask, queries = clouds("random", 0, 3)
+
+    def total(target, queries):
+        found = BruteForce.build(target, jnp.asarray(mask)).query(queries, k=2)
+        return jnp.sum(found.sq_distance), found.index
+
+    gradient = jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))
+    (to_target, to_queries), row = gradient(target, queries)
+    delta = 2 * (queries[:, None] - target[row])
+    np.testing.assert_allclose(to_queries, delta.sum(1), rtol=1e-5, atol=1e-6)
+    expected = np.zeros_like(target)
+    np.add.at(expected, np.asarray(row), -delta)
+    np.testing.assert_allclose(to_target, expected, rtol=1e-5, atol=1e-5)
+
+
+class _First(AbstractIndex):
+    points: jax.Array
+    mask: jax.Array
+
+    @classmethod
+    def build(cls, points, mask=None):
+        return cls(points, jnp.ones(len(points), bool) if mask is None else mask)
+
+    def lookup(self, columns):
+        return jnp.zeros(columns.shape[1], jnp.int32)
+
+
+def test_a_k_that_cannot_be_answered_is_refused():
+    points = jnp.zeros((4, 3), jnp.float32)
+    with pytest.raises(ValueError, match=r"k must be at least 1, got k=0"):
+        _First.build(points).query(points, k=0)
+    with pytest.raises(ValueError, match=r"_First finds .* \(k=1\), not k=2"):
+        _First.build(points).query(points, k=2)
