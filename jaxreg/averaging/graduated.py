@@ -29,9 +29,9 @@ from jaxreg.robust import Correntropy
 
 # Widths in deviations, round by round, and tolerances of the minimisations. At ten,
 # right edges lose nothing, and the wrong ones of large graphs are far beyond.
-_WIDTHS = (40.0, 20.0, 10.0, 10.0)
-_TOLERANCES = (1e-2, 1e-2, 1e-3, 1e-6)
-_LATE = (0, 0, 0, 1)
+_WIDTHS = (40.0, 20.0, 10.0, 10.0, 10.0)
+_TOLERANCES = (1e-2, 1e-2, 1e-3, 1e-3, 1e-6)
+_LATE = (0, 0, 0, 1, 1)
 
 
 class _State(NamedTuple):
@@ -54,7 +54,7 @@ def graduated(
         W = precisions(g, ones, parts)
         return robust_problem(g, log_error, W, Correntropy(), width)
 
-    def turn(s: _State, plan: tuple[Array, Array, Array]) -> tuple[_State, None]:
+    def turn(s: _State, plan: Array) -> tuple[_State, None]:
         deviations, tolerance, late = plan
         parts = _parts(fixed, s.found.T)
         now = problem(fixed, parts, s.width)
@@ -72,7 +72,7 @@ def graduated(
         jnp.ones((2,), T_start.dtype),
         one,
     )
-    plan = tuple(jnp.asarray(x, one.dtype) for x in (_WIDTHS, _TOLERANCES, _LATE))
+    plan = jnp.asarray((_WIDTHS, _TOLERANCES, _LATE), one.dtype).T
     end = jax.lax.scan(turn, begin, plan)[0]
 
     def trust_of(g: PoseGraph, T: Array, _: Array) -> Array:
