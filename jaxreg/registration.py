@@ -19,7 +19,7 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.cloud import centroid, rms_radius
 from jaxreg.geometry import lie
-from jaxreg.local import AbstractRegistrar, RegistrationSolution
+from jaxreg.local import AbstractRegistrar, Curvature, Modes, RegistrationSolution
 from jaxreg.particle import ParticleFilter
 
 
@@ -157,7 +157,7 @@ def _register_pair(
         R = lie.rotation(init)
         shift = R @ source_mean + lie.translation(init) - target_mean
         init = lie.compose(R, shift / radius)
-    solution = method.solve(
+    solution = method.in_unit(radius).solve(
         method.prepare((source - source_mean) / radius, source_mask),
         method.prepare((target - target_mean) / radius, target_mask),
         init,
@@ -172,23 +172,25 @@ def _register_pair(
         return jnp.where(enough, T, lie.compose(eye, jnp.zeros_like(t)))
 
     status = jnp.where(enough, solution.status, Status.TOO_FEW_POINTS)
-    return eqx.tree_at(
-        lambda s: (
-            s.T_target_source,
-            s.modes.T_target_source,
-            s.inlier_rmse,
-            s.fitness,
-            s.overlap,
-            s.status,
-        ),
-        solution,
-        (
-            back(solution.T_target_source),
+    curvature = Curvature(
+        solution.H, solution.b, solution.error, solution.covariance
+    ).scaled(radius)
+    return RegistrationSolution(
+        T_target_source=back(solution.T_target_source),
+        status=status.astype(jnp.int32),
+        fitness=jnp.where(enough, solution.fitness, 0),
+        inlier_rmse=radius * solution.inlier_rmse,
+        num_inliers=jnp.where(enough, solution.num_inliers, 0),
+        overlap=jnp.where(enough, solution.overlap, 0),
+        num_steps=solution.num_steps,
+        H=curvature.H,
+        b=curvature.b,
+        error=curvature.error,
+        covariance=curvature.covariance,
+        modes=Modes(
             jax.vmap(back)(solution.modes.T_target_source),
-            radius * solution.inlier_rmse,
-            jnp.where(enough, solution.fitness, 0),
-            jnp.where(enough, solution.overlap, 0),
-            status.astype(jnp.int32),
+            solution.modes.weight,
+            solution.modes.fitness,
         ),
     )
 
@@ -201,7 +203,8 @@ def _finite(points: Array, mask: Array) -> tuple[Array, Array]:
 
 def _distinct_enough(points: Array, mask: Array) -> Array:
     """Whether at least d + 1 distinct points are valid."""
-    order = jnp.lexsort((*points.T, ~mask))
-    ordered, valid = points[order], mask[order]
-    new = jnp.any(ordered[1:] != ordered[:-1], axis=1) & valid[1:]
-    return jnp.sum(new) + jnp.any(mask) >= points.shape[1] + 1
+    new, num = mask, jnp.zeros((), jnp.int32)
+    for _ in range(points.shape[1] + 1):
+        num = num + jnp.any(new)
+        new = new & jnp.any(points != points[jnp.argmax(new)], axis=1)
+    return num > points.shape[1]

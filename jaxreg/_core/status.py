@@ -19,6 +19,7 @@ class Status(enum.IntEnum):
     LOW_OVERLAP = 5
     AMBIGUOUS = 6
     DISCONNECTED = 7
+    DIVERGED = 8
 
     @property
     def advice(self) -> str:
@@ -51,6 +52,10 @@ _ADVICE = {
     Status.AMBIGUOUS: (
         "Several poses agree about equally well (a symmetric object?). See the modes "
         "of the solution, or give an initial guess."
+    ),
+    Status.DIVERGED: (
+        "The steps led to a worse pose than the initial guess, which is returned. "
+        "Start nearer, use a robust kernel, or search with ParticleFilter."
     ),
     Status.DISCONNECTED: (
         "The trusted edges do not reach every pose. See `placed`; poses that are not "

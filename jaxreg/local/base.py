@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.status import Status
-from jaxreg._core.typing import Key, Mask, Motion, Points
+from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import PointCloud
 
 
@@ -34,8 +34,17 @@ class RegistrationSolution(eqx.Module):
         fitness: share of the source that lies on the target at this pose.
         inlier_rmse: root mean square distance of that share to the target's tangent
             planes, in the unit of the input.
+        num_inliers: int32, points of the (thinned) source in that share.
         overlap: the lesser of the shares of source and target that lie on the other.
         num_steps: int32, steps of the local optimiser along the winning path.
+        H: `(k, k)` Gauss-Newton matrix of the weighted energy of the last step, for a
+            tangent (v, w), translation first: R -> exp(w) R, c -> c + v, where c is
+            the image of the source's centroid.
+        b: `(k,)` its descent direction, nearly zero at a minimum.
+        error: that energy, the weighted sum of half squared residuals.
+        covariance: `(k, k)` of the same tangent, by Huber's sandwich: right for
+            independent errors of any size, too small where neighbouring points err
+            together. Lengths are in the unit of the input.
         modes: distinct poses with weights; one for a local method.
     """
 
@@ -43,8 +52,13 @@ class RegistrationSolution(eqx.Module):
     status: Int[Array, "*b"]
     fitness: Float[Array, "*b"]
     inlier_rmse: Float[Array, "*b"]
+    num_inliers: Int[Array, "*b"]
     overlap: Float[Array, "*b"]
     num_steps: Int[Array, "*b"]
+    H: Float[Array, "*b k k"]
+    b: Float[Array, "*b k"]
+    error: Float[Array, "*b"]
+    covariance: Float[Array, "*b k k"]
     modes: Modes
 
     def __repr__(self) -> str:
@@ -69,6 +83,13 @@ class AbstractRegistrar(eqx.Module):
     `solve` works in frames prepared by `register`: both clouds centred at their
     centroids and scaled so that the target's root mean square radius is one.
     """
+
+    def in_unit(self, length: Scalar) -> "AbstractRegistrar":
+        """The method with its lengths, given in the unit of the input, in `length`s.
+
+        Most methods have none: their lengths follow from the data.
+        """
+        return self
 
     @abc.abstractmethod
     def prepare(self, points: Points, mask: Mask) -> PointCloud:

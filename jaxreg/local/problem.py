@@ -45,6 +45,20 @@ class Problem(eqx.Module):
             index,
         )
 
+    def of_rows(self, rows: Int[Array, " r"] | slice) -> "Problem":
+        """The problem of some of the source points."""
+        return Problem(
+            self.source[:, rows],
+            self.source_normals[:, rows],
+            self.source_mask[rows],
+            self.target,
+            self.index,
+        )
+
+    def every(self, step: int) -> "Problem":
+        """The problem of every `step`-th source point."""
+        return self.of_rows(slice(None, None, step))
+
 
 class Match(eqx.Module):
     """Source points under a pose beside their closest target points.
@@ -95,13 +109,18 @@ def rotate(R: Float[Array, "d d"], columns: Float[Array, "d n"]) -> Float[Array,
     return jnp.stack([sum_rows(R[k][:, None] * columns) for k in range(R.shape[0])])
 
 
-def match(problem: Problem, T_target_source: Motion) -> Match:
-    """Closest target points of the source under a pose (PF paper, Eq. 2)."""
+def match(
+    problem: Problem, T_target_source: Motion, row: Int[Array, " n"] | None = None
+) -> Match:
+    """Closest target points of the source under a pose (PF paper, Eq. 2).
+
+    Where `row` is given, those rows of the target are taken instead of the closest.
+    """
     d = problem.source.shape[0]
     R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
     rotated = rotate(R, problem.source)
     moved = rotated + t[:, None]
-    row = problem.index.lookup(moved)
+    row = problem.index.lookup(moved) if row is None else row
     found = problem.target[row]
     normal = jnp.stack([found[:, d + k] for k in range(d)])
     residual = jnp.stack([found[:, k] for k in range(d)]) - moved

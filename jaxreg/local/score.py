@@ -2,12 +2,12 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxreg._core.typing import Motion
 from jaxreg.cloud import PointCloud
 from jaxreg.geometry import lie
-from jaxreg.local.problem import Problem, match
+from jaxreg.local.problem import Match, Problem, match
 from jaxreg.neighbours.base import AbstractIndex
 
 
@@ -23,6 +23,7 @@ class Score(eqx.Module):
 
     fitness: Float[Array, ""]
     inlier_rmse: Float[Array, ""]
+    num_inliers: Int[Array, ""]
 
 
 def score(
@@ -35,7 +36,11 @@ def score(
         T_target_source: the pose.
         spacing: distance between samples of the coarser cloud.
     """
-    found = match(problem, T_target_source)
+    return score_match(match(problem, T_target_source), spacing)
+
+
+def score_match(found: Match, spacing: Float[Array, ""]) -> Score:
+    """`score` of correspondences that are known already."""
     plane = found.plane_residual
     flat = jnp.any(found.normal != 0, axis=0)
     height = jnp.where(flat, plane**2, found.sq_residual)
@@ -43,12 +48,13 @@ def score(
         (found.sq_residual < (_REACH * spacing) ** 2)
         & (height < (_PLANE * spacing) ** 2)
         & (found.agreement > _COSINE_SQ)
-        & problem.source_mask
+        & found.mask
     )
     count = jnp.sum(inlier)
-    total = jnp.maximum(jnp.sum(problem.source_mask), 1)
+    total = jnp.maximum(jnp.sum(found.mask), 1)
     sq = jnp.sum(jnp.where(inlier, height, 0)) / jnp.maximum(count, 1)
-    return Score((count / total).astype(sq.dtype), jnp.sqrt(sq))
+    fitness = (count / total).astype(sq.dtype)
+    return Score(fitness, jnp.sqrt(sq), count.astype(jnp.int32))
 
 
 def score_both_ways(

@@ -18,7 +18,7 @@ from jaxreg.geometry import lie
 from jaxreg.local import Problem, match, score, turn_and_shift
 from jaxreg.local.residuals import weighted_gram
 from jaxreg.multiview.scans import PreparedScans
-from jaxreg.neighbours import AbstractIndex, BruteForce
+from jaxreg.neighbours import AbstractIndex, exact_index
 from jaxreg.robust import GemanMcClure
 
 
@@ -53,7 +53,9 @@ def refine_jointly(
         source, target = scans.cloud(j), scans.cloud(i)
         index: AbstractIndex = scans.table(i)
         if exact:
-            index = BruteForce.build(target.points, target.mask)
+            index = exact_index(target.points.shape[0]).build(
+                target.points, target.mask
+            )
         return Problem.of(source, target, index)
 
     def overlapping(T: Array) -> Array:

@@ -28,12 +28,14 @@ from jaxreg.cloud import PointCloud, median_spacing, thin
 from jaxreg.geometry import lie
 from jaxreg.local import (
     AbstractRegistrar,
+    Curvature,
     GaussNewton,
     LocalOptimiser,
     Modes,
     PointToPlane,
     Problem,
     RegistrationSolution,
+    match,
     score_both_ways,
 )
 from jaxreg.neighbours import AbstractIndex, VoxelTable
@@ -185,13 +187,19 @@ class ParticleFilter(AbstractRegistrar):
         best = order[0]
         T = T_modes[best]
         modes = Modes(T_modes[order], mass[order], there.fitness[order])
+        curvature = self._curvature(problem, T, spacing)
         return RegistrationSolution(
             T_target_source=T,
             status=self._status(T, overlap[order], modes, source, target),
             fitness=there.fitness[best],
             inlier_rmse=there.inlier_rmse[best],
+            num_inliers=there.num_inliers[best],
             overlap=jnp.maximum(overlap[best], 0),
             num_steps=jnp.asarray(self._steps_of_a_path(), jnp.int32),
+            H=curvature.H,
+            b=curvature.b,
+            error=curvature.error,
+            covariance=curvature.covariance,
             modes=modes,
         )
 
@@ -268,6 +276,15 @@ class ParticleFilter(AbstractRegistrar):
         refined = lax.map(lambda T: optimiser.repeat(problem, T, widths), T)
         return lie.orthonormalise(refined)
 
+    def _curvature(self, problem: Problem, T: Motion, spacing: Scalar) -> Curvature:
+        """Of the last refinement's energy."""
+        optimiser = cast_floats(
+            LocalOptimiser(PointToPlane(), self.kernel, GaussNewton()), T.dtype
+        )
+        found = match(problem, T)
+        weight = optimiser.weights(found, 0.5 * spacing)
+        return Curvature.of(optimiser.residual, found, weight)
+
     def _status(
         self,
         T: Motion,
@@ -295,10 +312,4 @@ def _some_points(key: Key, problem: Problem, num: int) -> Problem:
         return problem
     order = jax.random.uniform(key, problem.source_mask.shape, problem.source.dtype)
     rows = jnp.argsort(jnp.where(problem.source_mask, order, 2))[:num]
-    return Problem(
-        problem.source[:, rows],
-        problem.source_normals[:, rows],
-        problem.source_mask[rows],
-        problem.target,
-        problem.index,
-    )
+    return problem.of_rows(rows)

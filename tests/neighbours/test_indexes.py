@@ -7,10 +7,10 @@ import pytest
 from clouds import M, N, clouds, compiled, distances, few, kinds, scales, seeds
 from hypothesis import given
 
-from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
+from jaxreg.neighbours import AbstractIndex, BoxTree, BruteForce, VoxelTable
 
 
-EXACT = [BruteForce]
+EXACT = [BruteForce, BoxTree]
 INDEXES = [*EXACT, VoxelTable]
 
 
@@ -71,7 +71,7 @@ def test_queries_that_are_not_finite_are_flagged_alone(index):
     assert np.all((np.asarray(found.index) >= 0) & (np.asarray(found.index) < M))
 
 
-@pytest.mark.parametrize("index", [BruteForce, VoxelTable])
+@pytest.mark.parametrize("index", INDEXES)
 def test_targets_that_are_not_finite_are_never_found(index):
     target, mask, queries = clouds("random", 0, 3)
     mask[:] = True

@@ -140,5 +140,7 @@ def test_options_out_of_range_are_refused():
     with pytest.raises(ValueError, match="candidates=0"):
         VoxelTable.build(points, candidates=0)
     table = jax.eval_shape(lambda p: VoxelTable.build(p, candidates=2), points)
-    with pytest.raises(ValueError, match=r"VoxelTable holds 2 candidates a cell, not k=3"):
+    with pytest.raises(
+        ValueError, match=r"VoxelTable holds 2 candidates a cell, not k=3"
+    ):
         table.query(points, k=3)

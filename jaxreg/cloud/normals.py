@@ -1,0 +1,142 @@
+"""Normals from the moments of cells: no search for neighbours.
+
+Every cell keeps the number, mean and spread of its points. The moments around a place
+are those of its 2^d nearest cells with multilinear weights, so the window of about two
+cells moves with the place; the direction of least spread is the normal (Hoppe et al.
+1992). Where the window holds too little to span a plane, cells of two and four times
+the size answer. One sort, O(n) memory.
+"""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.typing import Scalar
+from jaxreg.cloud.cells import UNUSED, bits_per_axis, morton_keys
+from jaxreg.geometry.eigen import least_eigenvectors
+
+
+# Windows are made of cells of 2, 4, at last 8 times the size that keys were made with.
+_COARSEST = 3
+# The second least spread of a window, in cells, below which it does not span a plane.
+# A window full of a plane has 0.25.
+_SPAN_SQ = 0.03
+_MIN_POINTS = 5
+
+
+def normals_from_cells(
+    places: Float[Array, "p d"],
+    points: Float[Array, "n d"],
+    keys: Int[Array, " n"],
+    size: Scalar,
+) -> Float[Array, "p d"]:
+    """Unit normals of either sign at `places`; zero where undefined.
+
+    Args:
+        places: where normals are wanted, relative to the corner of the cells.
+        points: the samples, in the order of their keys, relative to that corner.
+        keys: ascending Morton numbers of the points' cells.
+        size: side of those cells.
+    """
+    d = points.shape[1]
+
+    def unfinished(state: tuple[Array, ...]) -> Array:
+        level, _, found = state
+        return (level <= _COARSEST) & ~jnp.all(found)
+
+    def fill(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        level, normals, found = state
+        vectors, spans = _least_spread(places, points, keys, size, level)
+        normals = jnp.where(~found & spans, vectors, normals)
+        return level + 1, normals, found | spans
+
+    start = (
+        jnp.asarray(1, jnp.int32),
+        jnp.zeros((d, places.shape[0]), points.dtype),
+        jnp.zeros(places.shape[0], bool),
+    )
+    return lax.while_loop(unfinished, fill, start)[1].T
+
+
+def _least_spread(
+    places: Array, points: Array, keys: Array, size: Array, level: Array
+) -> tuple[Float[Array, "d p"], Bool[Array, " p"]]:
+    d = points.shape[1]
+    size = size * (1 << level).astype(size.dtype)
+    cell_key, moments = _moments_of_cells(points, keys, size, level)
+    at = (places / size).T - 0.5
+    base = jnp.floor(at)
+    offset = at - base
+    last = (1 << (bits_per_axis(d) - level)) - 1
+    corners = np.array(list(itertools.product((0, 1), repeat=d)))
+    cell = base.astype(jnp.int32) + corners[:, :, None]  # (2^d, d, p)
+    inside = jnp.all((cell >= 0) & (cell <= last), axis=1)
+    key = morton_keys(jnp.swapaxes(jnp.clip(cell, 0, last), 0, 1))
+    row = jnp.minimum(jnp.searchsorted(cell_key, key), len(cell_key) - 1)
+    weight = jnp.prod(jnp.where(corners[:, :, None] == 1, offset, 1 - offset), axis=1)
+    weight = jnp.where(inside & (cell_key[row] == key), weight, 0)
+    num = jnp.sum(jnp.where(weight > 0, moments[0, row], 0), axis=0)
+    near = (weight * moments[:, row]).reshape(-1, places.shape[0])
+    shift = jnp.asarray(_shift_to_base(corners), at.dtype)
+    total = jnp.matmul(shift, near, precision=lax.Precision.HIGHEST)
+    count = jnp.where(total[0] > 0, total[0], 1)
+    mean = total[1 : d + 1] / count
+    spread = [
+        [total[_place_of(i, j, d)] / count - mean[i] * mean[j] for j in range(d)]
+        for i in range(d)
+    ]
+    vectors, second, _ = least_eigenvectors(jnp.stack([jnp.stack(r) for r in spread]))
+    return vectors, (num >= _MIN_POINTS) & (second > _SPAN_SQ)
+
+
+def _moments_of_cells(
+    points: Array, keys: Array, size: Array, level: Array
+) -> tuple[Int[Array, " n"], Float[Array, "r n"]]:
+    """Ascending numbers of filled cells, and sums of (1, x, x x') about their centres.
+
+    Lengths are in cells. Rows beyond the last filled cell are `UNUSED` and zero.
+    """
+    n, d = points.shape
+    key = jnp.where(keys == UNUSED, UNUSED, keys >> (d * level))
+    new = jnp.concatenate(
+        [jnp.zeros(1, jnp.int32), (key[1:] != key[:-1]).astype(jnp.int32)]
+    )
+    cell = jnp.cumsum(new)
+    cell_key = jnp.full(n, UNUSED, jnp.int32).at[cell].set(key)
+    x = (points / size).T
+    x = x - jnp.floor(x) - 0.5
+    rows = [jnp.ones_like(x[0]), *x]
+    rows += [x[i] * x[j] for i in range(d) for j in range(i, d)]
+    rows = jnp.where(key == UNUSED, 0, jnp.stack(rows))
+    sums = jax.ops.segment_sum(rows.T, cell, n, indices_are_sorted=True)
+    return cell_key, sums.T
+
+
+def _shift_to_base(corners: np.ndarray) -> np.ndarray:
+    """`(r, r * 2^d)`: sums moments of cells, given about each corner's own centre.
+
+    With y = x + c, the sums of 1, y, y y' are linear in those of 1, x, x x'.
+    """
+    d = corners.shape[1]
+    num_rows = 1 + d + d * (d + 1) // 2
+    out = np.zeros((num_rows, num_rows, len(corners)))
+    for at, corner in enumerate(corners):
+        out[range(num_rows), range(num_rows), at] = 1
+        out[1 : d + 1, 0, at] = corner
+        for i in range(d):
+            for j in range(i, d):
+                row = _place_of(i, j, d)
+                out[row, 0, at] = corner[i] * corner[j]
+                out[row, 1 + j, at] += corner[i]
+                out[row, 1 + i, at] += corner[j]
+    return out.reshape(num_rows, -1)
+
+
+def _place_of(i: int, j: int, d: int) -> int:
+    """The row of the second moment of axes i and j."""
+    pairs = [(a, b) for a in range(d) for b in range(a, d)]
+    return 1 + d + pairs.index((min(i, j), max(i, j)))

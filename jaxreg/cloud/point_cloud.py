@@ -1,0 +1,36 @@
+"""`PointCloud`: points with normals and a mask."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core.typing import Mask, Points
+
+
+class PointCloud(eqx.Module):
+    """Points of which `mask` are valid, with unoriented unit normals.
+
+    Attributes:
+        points: `(n, d)`.
+        normals: `(n, d)` unit normals of either sign; zero where undefined.
+        mask: `(n,)` True for valid points.
+    """
+
+    points: Float[Array, "n d"]
+    normals: Float[Array, "n d"]
+    mask: Bool[Array, " n"]
+
+
+def centroid(points: Points, mask: Mask) -> Float[Array, " d"]:
+    """The mean of the valid points (zero where there are none)."""
+    weight = mask.astype(points.dtype)
+    first = points[jnp.argmax(mask)]  # sums of differences: safe far from the origin
+    mean = jnp.sum(weight[:, None] * (points - first), axis=0)
+    return first + mean / jnp.maximum(jnp.sum(weight), 1)
+
+
+def rms_radius(points: Points, mask: Mask) -> Float[Array, ""]:
+    """Root mean square distance of the valid points from their centroid."""
+    offset = jnp.where(mask[:, None], points - centroid(points, mask), 0)
+    num = jnp.maximum(jnp.sum(mask), 1).astype(points.dtype)
+    return jnp.sqrt(jnp.sum(offset**2) / num)

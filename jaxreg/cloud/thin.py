@@ -1,0 +1,90 @@
+"""Fewer points, evenly spread, with normals from all of them."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jaxreg._core.sorting import rows_in_order
+from jaxreg._core.typing import Mask, Points
+from jaxreg.cloud.cells import UNUSED, cell_keys, cell_size
+from jaxreg.cloud.normals import normals_from_cells
+from jaxreg.cloud.point_cloud import PointCloud
+from jaxreg.geometry.boxes import bounding_cube
+
+
+# Points in a cell of the size that normals are estimated with, where none are merged.
+_POINTS_PER_CELL = 2.5
+
+
+def thin(points: Points, mask: Mask, capacity: int) -> PointCloud:
+    """At most `capacity` points in spatial order, with normals from all the points.
+
+    Points that share a cell are replaced by their mean; the cell is chosen as small
+    as the capacity allows. A cloud that fits keeps its points. Normals are those of
+    `estimate_normals`.
+
+    Args:
+        points: `(n, d)`.
+        mask: `(n,)` True for valid points.
+        capacity: static number of rows of the result; rows that are not needed are
+            masked.
+
+    Gradients: with respect to the points through the means; normals are cut.
+    """
+    n = points.shape[0]
+    merge = n > capacity
+    low, size, rows, keys = _cells(points, mask, capacity if merge else None)
+    ordered, valid = points[rows] - low, mask[rows]
+    places = jnp.where(valid[:, None], ordered, 0)
+    samples = lax.stop_gradient(places)
+    if merge:
+        places, valid = _means(places, keys, capacity)
+    normals = normals_from_cells(lax.stop_gradient(places), samples, keys, size)
+    normals = jnp.where(valid[:, None], normals, 0)
+    return PointCloud(jnp.where(valid[:, None], places + low, 0), normals, valid)
+
+
+def estimate_normals(points: Points, mask: Mask) -> Points:
+    """Unit normals of `(n, d)` points from their surroundings; zero where undefined.
+
+    The sign is arbitrary. See `jaxreg.cloud.normals` for the window. Gradients: cut.
+    """
+    low, size, rows, keys = _cells(points, mask, None)
+    samples = lax.stop_gradient(jnp.where(mask[rows, None], points[rows] - low, 0))
+    normals = normals_from_cells(samples, samples, keys, size)
+    normals = jnp.where(mask[rows, None], normals, 0)
+    return jnp.zeros_like(normals).at[rows].set(normals)
+
+
+def _cells(
+    points: Array, mask: Array, capacity: int | None
+) -> tuple[Array, Array, Array, Array]:
+    """Corner and size of cells, rows in the order of the cells' keys, those keys.
+
+    At most `capacity` cells are filled; without, the cells are half as large as those
+    that hold a few points each.
+    """
+    frozen = lax.stop_gradient(points)
+    low, side = bounding_cube(frozen, mask)
+    if capacity is None:
+        num = jnp.sum(mask).astype(points.dtype)
+        few = jnp.maximum(num / _POINTS_PER_CELL, 1)
+        size = cell_size(frozen, mask, low, side, few) / 2
+        size = jnp.maximum(size, side / 1000)
+    else:
+        size = cell_size(frozen, mask, low, side, capacity)
+    keys = cell_keys(frozen, mask, low, size)
+    rows = rows_in_order(keys, 31)
+    return low, size, rows, keys[rows]
+
+
+def _means(ordered: Array, keys: Array, capacity: int) -> tuple[Array, Array]:
+    """Mean of the points of each cell, and which rows hold one."""
+    new = (keys[1:] != keys[:-1]).astype(jnp.int32)
+    cell = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(new)])
+    weight = (keys != UNUSED).astype(ordered.dtype)
+    cell = jnp.where(keys != UNUSED, cell, capacity)  # dropped by the sums
+    count = jax.ops.segment_sum(weight, cell, capacity)
+    total = jax.ops.segment_sum(weight[:, None] * ordered, cell, capacity)
+    return total / jnp.maximum(count, 1)[:, None], count > 0

@@ -1,0 +1,72 @@
+"""How sharply the matched points hold a pose."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg.local.problem import Match
+from jaxreg.local.residuals import AbstractResidual, PointToPlane, PointToPoint
+from jaxreg.local.steps import condition, gyration_radius
+from jaxreg.local.steps.tiny_solve import solve_semidefinite
+
+
+# Least over largest curvature of the energy below which a direction of the motion is
+# taken as free; rounding in float32 leaves about 1e-6.
+_DEGENERATE = 1e-5
+
+
+class Curvature(eqx.Module):
+    """The quadratic model of the energy at a pose, in the tangent (v, w).
+
+    The pose moves by R -> exp(w) R, c -> c + v, with c the image of the source's
+    centroid.
+
+    Attributes:
+        H: `(k, k)` Gauss-Newton matrix of the weighted energy.
+        b: `(k,)` its descent direction, zero at a minimum.
+        error: the energy, sum of w r^2 / 2.
+        covariance: `(k, k)` of the pose: H^-1 (sum of w^2 g g') H^-1 with g the
+            gradients of the points (Huber's sandwich), right for independent errors
+            of any size, too small where neighbouring points err together.
+    """
+
+    H: Float[Array, "k k"]
+    b: Float[Array, " k"]
+    error: Float[Array, ""]
+    covariance: Float[Array, "k k"]
+
+    @classmethod
+    def of(
+        cls, residual: AbstractResidual, found: Match, weight: Float[Array, " n"]
+    ) -> "Curvature":
+        """At the pose of a match."""
+        H, b = residual.normal_equations(found, weight)
+        # b is linear in the weights: its derivative holds the gradients of the points.
+        gradients = jax.jacrev(lambda w: residual.normal_equations(found, w)[1])(weight)
+        spread = gradients * weight
+        meat = jnp.matmul(spread, spread.T, precision=jax.lax.Precision.HIGHEST)
+        half = jax.vmap(solve_semidefinite, (None, 1), 1)(H, meat)
+        covariance = jax.vmap(solve_semidefinite, (None, 1), 1)(H, half.T)
+        return cls(H, b, residual.energy(found, weight), covariance)
+
+    def scaled(self, length: Float[Array, ""]) -> "Curvature":
+        """In a unit of length that is 1 / `length` times the present one."""
+        d = 2 if self.b.shape[0] == 3 else 3
+        unit = jnp.where(jnp.arange(self.b.shape[0]) < d, length, 1)
+        sq = length * length
+        return Curvature(
+            H=self.H * sq / jnp.outer(unit, unit),
+            b=self.b * sq / unit,
+            error=self.error * sq,
+            covariance=self.covariance * jnp.outer(unit, unit),
+        )
+
+
+def is_degenerate(
+    residual: AbstractResidual, found: Match, weight: Float[Array, " n"]
+) -> Array:
+    """Whether the matched surfaces leave some direction of the motion free."""
+    sharp = residual if isinstance(residual, PointToPoint) else PointToPlane(0.0)
+    H = sharp.normal_equations(found, weight)[0]
+    return condition(H, gyration_radius(found, weight)) < _DEGENERATE

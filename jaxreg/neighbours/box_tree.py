@@ -1,0 +1,216 @@
+"""Exact closest points at scale: two levels of boxes over points in Hilbert order.
+
+Consecutive points of the curve form leaves of 32, and 16 leaves a node; both know
+their bounding boxes. Queries are answered in tiles of 128, which are compact if the
+queries follow a curve as well: a tile visits the nodes, and in a node the leaves,
+nearest box first, as long as a box is closer than the worst of the tile's answers
+(branch and bound, Fukunaga and Narendra 1975, for a tile at once). A visit compares
+all pairs of the tile and the leaf without a branch, which XLA vectorises.
+
+Two properties of XLA on CPU shape the code: an integer `min` is vectorised and a float
+`min` to a scalar is not, so distances are reduced as the integers of the same bits,
+which order alike; and a value with two users is computed twice unless a loop of two
+or more trips returns it.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.typing import Mask, Points, Scalar
+from jaxreg.neighbours.base import AbstractIndex, Neighbours
+from jaxreg.neighbours.brute import BruteForce
+from jaxreg.neighbours.order import hilbert_order
+
+
+_LEAF = 32
+_NODE = 16
+_TILE = 128
+_UNROLL = 8
+
+
+class BoxTree(AbstractIndex):
+    """Exact search from a thousand to a million targets; O(n + m) memory.
+
+    Queries may come in any order: `query` sorts them along the curve, `lookup` is fast
+    where neighbours in memory are neighbours in space (`hilbert_order`), and slower
+    than brute force in random order. Ties go to any of the closest points.
+    """
+
+    points: Float[Array, "m d"]
+    mask: Bool[Array, " m"]
+    leaf_points: Float[Array, "l d w"]
+    leaf_rows: Int[Array, "l w"]
+    leaf_low: Float[Array, "s d u"]
+    leaf_high: Float[Array, "s d u"]
+    node_low: Float[Array, "d s"]
+    node_high: Float[Array, "d s"]
+
+    @classmethod
+    def build(cls, points: Points, mask: Mask | None = None) -> "BoxTree":
+        """Sorts the points along the curve and bounds them."""
+        m, d = points.shape
+        finite = jnp.all(jnp.isfinite(points), axis=1)
+        mask = finite if mask is None else mask & finite
+        frozen = lax.stop_gradient(points)
+        rows = hilbert_order(frozen, mask)
+        inf = jnp.asarray(jnp.inf, points.dtype)
+        ordered = jnp.where(mask[rows, None], frozen[rows], inf)
+        pad = -m % (_LEAF * _NODE)
+        ordered = jnp.pad(ordered, ((0, pad), (0, 0)), constant_values=inf)
+        leaves = ordered.reshape(-1, _LEAF, d)
+        low = jnp.min(leaves, axis=1)
+        high = jnp.max(jnp.where(leaves < inf, leaves, -inf), axis=1)
+        low, high = low.reshape(-1, _NODE, d), high.reshape(-1, _NODE, d)
+        return cls(
+            points,
+            mask,
+            jnp.swapaxes(leaves, 1, 2),
+            jnp.pad(rows, (0, pad)).reshape(-1, _LEAF),
+            jnp.swapaxes(low, 1, 2),
+            jnp.swapaxes(high, 1, 2),
+            jnp.min(low, axis=1).T,
+            jnp.max(high, axis=1).T,
+        )
+
+    def lookup(self, columns: Float[Array, "d n"]) -> Int[Array, " n"]:
+        """A closest valid target of each query."""
+        d, n = columns.shape
+        columns = lax.stop_gradient(columns)
+        # A query that is not finite would spoil the bounds of its tile.
+        finite = jnp.all(jnp.isfinite(columns), axis=0)
+        columns = jnp.where(finite, columns, self.leaf_points[0, :, :1])
+        tile = min(_TILE, n)
+        padded = jnp.pad(columns, ((0, 0), (0, -n % tile)), mode="edge")
+        tiles = jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
+        leaf = lax.map(self._leaf_of_tile, tiles).reshape(-1)[:n]
+        return self._row_in_leaf(columns, leaf)
+
+    def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
+        """By brute force: O(n m) time."""
+        return BruteForce(self.points, self.mask).lookup_nearest(columns, k)
+
+    def query(
+        self, points: Points, k: int = 1, radius: Scalar | float | None = None
+    ) -> Neighbours:
+        """As of any index, with the queries sorted along the curve."""
+        everyone = jnp.ones(points.shape[0], bool)
+        order = hilbert_order(jnp.nan_to_num(lax.stop_gradient(points)), everyone)
+        found = super().query(points[order], k, radius)
+        place = (
+            jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=jnp.int32))
+        )
+        return jax.tree.map(lambda x: x[place], found)
+
+    def _leaf_of_tile(self, queries: Float[Array, "d t"]) -> Int[Array, " t"]:
+        """The leaf that holds the closest point of each query."""
+        low, high = jnp.min(queries, axis=1), jnp.max(queries, axis=1)
+        to_nodes = _box_distance(self.node_low, self.node_high, low, high)
+        used = _bits(jnp.asarray(jnp.inf, queries.dtype))
+
+        def visit_node(state: tuple[Array, ...]) -> tuple[Array, ...]:
+            _, node, to_nodes, best, leaf = state
+            to_leaves = _box_distance(
+                self.leaf_low[node], self.leaf_high[node], low, high
+            )
+
+            def visit_leaf(state: tuple[Array, ...]) -> tuple[Array, ...]:
+                _, at, to_leaves, best, leaf = state
+                number = node * _NODE + at
+                sq = _closest_in_leaf(queries, self.leaf_points, number)
+                closer = sq < best
+                best = jnp.where(closer, sq, best)
+                leaf = jnp.where(closer, number, leaf)
+                to_leaves = jnp.where(jnp.arange(_NODE) == at, used, to_leaves)
+                return (*_next(to_leaves, best), to_leaves, best, leaf)
+
+            start = (*_next(to_leaves, best), to_leaves, best, leaf)
+            *_, best, leaf = lax.while_loop(lambda s: s[0], visit_leaf, start)
+            to_nodes = lax.dynamic_update_index_in_dim(to_nodes, used, node, 0)
+            return (*_next(to_nodes, best), to_nodes, best, leaf)
+
+        # The leaf at the tile's centre comes first: the boxes of many may touch the
+        # tile itself.
+        leaf = jnp.full(queries.shape[1], self._leaf_at((low + high) / 2), jnp.int32)
+        best = _closest_in_leaf(queries, self.leaf_points, leaf[0])
+        start = (*_next(to_nodes, best), to_nodes, best, leaf)
+        return lax.while_loop(lambda s: s[0], visit_node, start)[-1]
+
+    def _leaf_at(self, point: Float[Array, " d"]) -> Int[Array, ""]:
+        """The leaf whose box is closest, in the node whose box is closest."""
+        node = _first_least(_box_distance(self.node_low, self.node_high, point, point))
+        low, high = self.leaf_low[node], self.leaf_high[node]
+        return node * _NODE + _first_least(_box_distance(low, high, point, point))
+
+    def _row_in_leaf(
+        self, columns: Float[Array, "d n"], leaf: Int[Array, " n"]
+    ) -> Int[Array, " n"]:
+        d = columns.shape[0]
+        flat = self.leaf_points.reshape(-1, d * _LEAF)
+
+        def part(step: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            best, lane = state
+            for at in range(_UNROLL):
+                at = step * _UNROLL + at
+                point = [flat[leaf, axis * _LEAF + at] for axis in range(d)]
+                sq = _sq_distance(columns, point)
+                lane = jnp.where(sq < best, at, lane)
+                best = jnp.minimum(best, sq)
+            return best, lane
+
+        start = (
+            jnp.full(leaf.shape, jnp.inf, columns.dtype),
+            jnp.zeros(leaf.shape, jnp.int32),
+        )
+        lane = lax.fori_loop(0, _LEAF // _UNROLL, part, start)[1]
+        return self.leaf_rows[leaf, lane]
+
+
+def _bits(x: Array) -> Array:
+    """The integers of the bits: they order non-negative floats."""
+    return lax.bitcast_convert_type(
+        x, jnp.int32 if x.dtype == jnp.float32 else jnp.int64
+    )
+
+
+def _box_distance(low: Array, high: Array, from_low: Array, from_high: Array) -> Array:
+    """Bits of the squared distances from one box to boxes given as `(d, s)`."""
+    sq = jnp.zeros(low.shape[1:], low.dtype)
+    for axis in range(low.shape[0]):
+        gap = jnp.maximum(low[axis] - from_high[axis], from_low[axis] - high[axis])
+        sq = sq + jnp.maximum(gap, 0) ** 2
+    return _bits(sq)
+
+
+def _first_least(x: Int[Array, " s"]) -> Int[Array, ""]:
+    number = jnp.arange(x.shape[0], dtype=jnp.int32)
+    return jnp.min(jnp.where(x == jnp.min(x), number, number[-1]))
+
+
+def _next(to_boxes: Array, best: Array) -> tuple[Array, Array]:
+    """Whether the closest box may improve the tile's worst answer, and its number."""
+    return jnp.min(to_boxes) < jnp.max(_bits(best)), _first_least(to_boxes)
+
+
+def _closest_in_leaf(queries: Array, leaf_points: Array, number: Array) -> Array:
+    """Squared distance of each query to the closest point of a leaf."""
+    d = queries.shape[0]
+
+    def part(step: Array, best: Array) -> Array:
+        at = (number, jnp.zeros_like(number), (step * _UNROLL).astype(number.dtype))
+        points = lax.dynamic_slice(leaf_points, at, (1, d, _UNROLL))[0]
+        for lane in range(_UNROLL):
+            best = jnp.minimum(best, _sq_distance(queries, points[:, lane]))
+        return best
+
+    start = jnp.full(queries.shape[1], jnp.inf, queries.dtype)
+    return lax.fori_loop(0, _LEAF // _UNROLL, part, start)
+
+
+def _sq_distance(a: Array, b: Array | list[Array]) -> Array:
+    """Sum over the d rows, unrolled: XLA vectorises over the points."""
+    sq = (a[0] - b[0]) ** 2
+    for axis in range(1, a.shape[0]):
+        sq = sq + (a[axis] - b[axis]) ** 2
+    return sq
