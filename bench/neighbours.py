@@ -110,7 +110,7 @@ def tree_rows(target: np.ndarray, sets: list[np.ndarray]) -> list[str]:
     seconds = best_time(lambda: build(points))
     tree = build(points)
     query = jax.jit(lambda tree, x: tree.query(x))
-    everyone = np.ones(NUM_QUERIES, bool)
+    everyone = jnp.ones(NUM_QUERIES, bool)
     lookups, queries = [], []
     for x in map(jnp.asarray, sets):
         lookups.append(own_rate(tree, np.asarray(x[hilbert_order(x, everyone)])))
