@@ -59,7 +59,9 @@ def test_thinning_far_from_the_origin_keeps_the_shape():
 def test_median_spacing_is_that_of_a_grid_and_ignores_duplicates():
     x = np.stack(np.meshgrid(*[np.arange(16.0)] * 2), -1).reshape(-1, 2)
     doubled = jnp.asarray(np.repeat(0.25 * x, 2, axis=0), jnp.float32)
-    assert float(jax.jit(median_spacing)(doubled, jnp.ones(512, bool))) == pytest.approx(0.25)
+    assert float(
+        jax.jit(median_spacing)(doubled, jnp.ones(512, bool))
+    ) == pytest.approx(0.25)
     assert float(jax.jit(median_spacing)(doubled, jnp.zeros(512, bool))) == 0
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Array
 from jaxreg._core.sorting import rows_in_order
 from jaxreg._core.typing import Mask, Points
 from jaxreg.cloud.cells import UNUSED, cell_keys, cell_size
+from jaxreg.cloud.nearest_normals import normals_from_neighbours
 from jaxreg.cloud.normals import normals_from_cells
 from jaxreg.cloud.point_cloud import PointCloud
 from jaxreg.geometry.boxes import bounding_cube
@@ -17,18 +18,21 @@ from jaxreg.geometry.boxes import bounding_cube
 _POINTS_PER_CELL = 2.5
 
 
-def thin(points: Points, mask: Mask, capacity: int) -> PointCloud:
+def thin(
+    points: Points, mask: Mask, capacity: int, num_neighbours: int | None = None
+) -> PointCloud:
     """At most `capacity` points in spatial order, with normals from all the points.
 
     Points that share a cell are replaced by their mean; the cell is chosen as small
-    as the capacity allows. A cloud that fits keeps its points. Normals are those of
-    `estimate_normals`.
+    as the capacity allows. A cloud that fits keeps its points.
 
     Args:
         points: `(n, d)`.
         mask: `(n,)` True for valid points.
         capacity: static number of rows of the result; rows that are not needed are
             masked.
+        num_neighbours: static; normals are estimated from the points around that many
+            nearest places, or by `estimate_normals`' cells, ten times faster.
 
     Gradients: with respect to the points through the means; normals are cut.
     """
@@ -38,10 +42,22 @@ def thin(points: Points, mask: Mask, capacity: int) -> PointCloud:
     ordered, valid = points[rows] - low, mask[rows]
     places = jnp.where(valid[:, None], ordered, 0)
     samples = lax.stop_gradient(places)
+    cell = _cell_numbers(keys) if merge else jnp.arange(n, dtype=jnp.int32)
+    count = valid.astype(points.dtype)
     if merge:
-        places, valid = _means(places, keys, capacity)
-    normals = normals_from_cells(lax.stop_gradient(places), samples, keys, size)
-    normals = jnp.where(valid[:, None], normals, 0)
+        count = jax.ops.segment_sum(count, cell, capacity)
+        total = jax.ops.segment_sum(places, cell, capacity)
+        places, valid = total / jnp.maximum(count, 1)[:, None], count > 0
+    frozen = lax.stop_gradient(places)
+    if num_neighbours is None:
+        normals = normals_from_cells(frozen, samples, keys, size)
+        normals = jnp.where(valid[:, None], normals, 0)
+    else:
+        offset = jnp.where(keys[:, None] != UNUSED, samples - frozen[cell], 0)
+        spread = jax.ops.segment_sum(
+            offset[:, :, None] * offset[:, None, :], cell, len(valid)
+        )
+        normals = normals_from_neighbours(frozen, valid, count, spread, num_neighbours)
     return PointCloud(jnp.where(valid[:, None], places + low, 0), normals, valid)
 
 
@@ -79,12 +95,7 @@ def _cells(
     return low, size, rows, keys[rows]
 
 
-def _means(ordered: Array, keys: Array, capacity: int) -> tuple[Array, Array]:
-    """Mean of the points of each cell, and which rows hold one."""
+def _cell_numbers(keys: Array) -> Array:
+    """The number of each point's cell; one too many for points that are not valid."""
     new = (keys[1:] != keys[:-1]).astype(jnp.int32)
-    cell = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(new)])
-    weight = (keys != UNUSED).astype(ordered.dtype)
-    cell = jnp.where(keys != UNUSED, cell, capacity)  # dropped by the sums
-    count = jax.ops.segment_sum(weight, cell, capacity)
-    total = jax.ops.segment_sum(weight[:, None] * ordered, cell, capacity)
-    return total / jnp.maximum(count, 1)[:, None], count > 0
+    return jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(new)])

@@ -31,7 +31,7 @@ _UNROLL = 8
 
 
 class BoxTree(AbstractIndex):
-    """Exact search from a thousand to a million targets; O(n + m) memory.
+    """Exact search from some thousand to a million targets; O(n + m) memory.
 
     Queries may come in any order: `query` sorts them along the curve, `lookup` is fast
     where neighbours in memory are neighbours in space (`hilbert_order`), and slower

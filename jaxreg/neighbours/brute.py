@@ -1,6 +1,6 @@
 """Exact closest points by comparing every pair, tile by tile.
 
-The oracle of all other indexes, and the fastest exact search for a few hundred
+The oracle of all other indexes, and the fastest exact search for a few thousand
 targets. Targets are compared in groups of 16: the least squared distance of a group to
 every query of a tile is one branch-free expression, which XLA on CPU turns into vector
 code of about 6 billion pairs a second. Only the best group of each query is kept; the

@@ -49,6 +49,8 @@ from jaxreg.robust import AbstractKernel, GemanMcClure
 
 
 _REFINE_STEPS = 24
+# The agreement of normals decides what is believed: the careful estimate.
+_NORMAL_NEIGHBOURS = 10
 
 
 class ParticleFilter(AbstractRegistrar):
@@ -133,7 +135,7 @@ class ParticleFilter(AbstractRegistrar):
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
         """Thinned to `max_points`, with normals."""
-        return thin(points, mask, self.max_points)
+        return thin(points, mask, self.max_points, _NORMAL_NEIGHBOURS)
 
     def solve(
         self,
