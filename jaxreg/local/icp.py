@@ -69,7 +69,8 @@ class ICP(AbstractRegistrar):
 
     Fails: TOO_FEW_POINTS, NON_FINITE, MAX_STEPS; LOW_OVERLAP where nothing agrees;
     DEGENERATE where the matched surfaces leave a direction free (it is left as in the
-    guess); DIVERGED where the end fits worse than the guess, which is returned.
+    guess); DIVERGED where the end fits worse than the guess, which is returned
+    (the scores are those of the end).
 
     Gradients: with respect to both clouds at the solution, correspondences, kernel
     weights and normals held (the derivative of one step there, which is that of the
@@ -134,8 +135,8 @@ class ICP(AbstractRegistrar):
         status = jnp.where(state.moving, Status.MAX_STEPS, Status.CONVERGED)
         degenerate = is_degenerate(self.residual, found, weight)
         status = jnp.where(degenerate, Status.DEGENERATE, status)
-        status = jnp.where(worse, Status.DIVERGED, status)
         status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
+        status = jnp.where(worse, Status.DIVERGED, status)
         status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
         curvature = Curvature.of(self.residual, found, weight)
         return RegistrationSolution(

@@ -1,0 +1,120 @@
+"""`ICP`: what it reports, and input that leaves it little to work with."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import blob, motion, move, pose_error
+
+import jaxreg as jr
+from jaxreg import Status
+from jaxreg.robust import L2
+
+
+N, M = 500, 800
+
+
+def _flat(num: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    points = np.zeros((num, 3), np.float32)
+    points[:, :2] = rng.uniform(-1, 1, (num, 2))
+    return points
+
+
+def _finite(sol: jr.RegistrationSolution) -> bool:
+    return bool(np.all(np.isfinite(sol.T_target_source)))
+
+
+@pytest.fixture(scope="module")
+def near():
+    T = motion(3, 3, angle=0.5)
+    source, target = move(np.linalg.inv(T), blob(N, 3, seed=1)), blob(M, 3, seed=2)
+    init = motion(9, 3, angle=0.1, shift=0.05) @ T
+    return source, target, T, init, jr.register(source, target, jr.ICP(), init=init)
+
+
+def test_covariance_has_the_size_of_the_error(near):
+    source, _, T, init, sol = near
+    assert sol.covariance.shape == sol.H.shape == (6, 6)
+    np.testing.assert_allclose(sol.covariance, sol.covariance.T, rtol=1e-3, atol=1e-9)
+    assert float(np.linalg.eigvalsh(sol.covariance).min()) > 0
+    angle, _ = pose_error(sol.T_target_source, T)
+    deviation = float(np.sqrt(np.trace(sol.covariance[3:, 3:])))
+    assert angle / 30 < deviation < 3 * angle + 1e-2
+    # Converged: the step that is left is far below that.
+    step = np.linalg.solve(np.asarray(sol.H, float), np.asarray(sol.b, float))
+    assert np.linalg.norm(step[3:]) < deviation
+    assert float(sol.error) > 0
+    assert int(sol.num_inliers) == pytest.approx(float(sol.fitness) * N, abs=1)
+
+
+def test_unit_of_the_input_scales_curvature_and_covariance(near):
+    source, target, _, init, sol = near
+    init = np.array(init)
+    init[:3, 3] *= 1000
+    mm = jr.register(1000 * source, 1000 * target, jr.ICP(), init=init)
+    unit = np.array([1000.0] * 3 + [1.0] * 3)
+    np.testing.assert_allclose(
+        mm.covariance / np.outer(unit, unit), sol.covariance, rtol=0.1, atol=1e-7
+    )
+
+
+def test_pairs_beyond_the_largest_distance_do_not_count(near):
+    source, target, T, init, _ = near
+    # A second object far from the target would pull the answer under L2.
+    far = np.concatenate([source[: N // 2], source[: N // 2] + np.float32(3)])
+    method = jr.ICP(jr.PointToPoint(), L2(), max_correspondence_distance=0.3)
+    sol = jr.register(far, target, method, init=init)
+    free = jr.register(far, target, jr.ICP(jr.PointToPoint(), L2()), init=init)
+    assert pose_error(sol.T_target_source, T)[0] < 0.1
+    assert pose_error(free.T_target_source, T)[0] > 0.2
+
+
+def test_a_plane_on_a_plane_is_degenerate():
+    sol = jr.register(_flat(N, 0), _flat(M, 1), jr.ICP(), init=np.eye(4))
+    assert int(sol.status) == Status.DEGENERATE
+    assert _finite(sol)
+
+
+def test_an_end_worse_than_the_guess_is_reported_and_the_guess_returned(near):
+    source, target, T, _, _ = near
+    guess = motion(26, 3, angle=1.2, shift=1.5) @ T
+    method = jr.ICP(jr.Symmetric(), L2(), max_steps=3)
+    sol = jr.register(source, target, method, init=guess)
+    assert int(sol.status) == Status.DIVERGED
+    np.testing.assert_allclose(sol.T_target_source, guess, atol=1e-4)
+
+
+def _line(num: int) -> np.ndarray:
+    return np.linspace(0, 1, num, dtype=np.float32)[:, None] * np.ones(3, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        (np.ones((N, 3), np.float32), {Status.TOO_FEW_POINTS}),
+        (np.full((N, 3), np.nan, np.float32), {Status.TOO_FEW_POINTS}),
+        (_line(N), {Status.DEGENERATE, Status.LOW_OVERLAP}),
+        (
+            np.repeat(blob(10, 3), N // 10, axis=0),
+            {Status.CONVERGED, Status.LOW_OVERLAP, Status.MAX_STEPS},
+        ),
+        (blob(N, 3) + np.float32(1e9), set(Status)),
+        (blob(N, 3) * np.float32(1e-20), set(Status)),
+    ],
+    ids=["one-place", "nan", "line", "duplicates", "far", "tiny"],
+)
+def test_poor_input_gets_a_status_and_a_finite_pose(source, expected):
+    sol = jr.register(source, blob(M, 3, seed=2), jr.ICP(), init=np.eye(4))
+    status = Status(int(sol.status))
+    assert status in expected
+    if status == Status.CONVERGED:
+        assert _finite(sol)
+        assert np.isfinite(float(sol.fitness))
+        assert np.isfinite(float(sol.inlier_rmse))
+
+
+def test_parts_that_do_nothing_are_refused():
+    with pytest.raises(ValueError, match="max_steps"):
+        jr.ICP(max_steps=0)
+    with pytest.raises(ValueError, match="dimension"):
+        jr.register(jnp.zeros((9, 2)), jnp.zeros((9, 3)), jr.ICP())
