@@ -19,6 +19,7 @@ LAYERS = {
     "cloud": 3,
     "averaging": 3,
     "local": 4,
+    "correlation": 5,
     "particle": 5,
     "registration": 6,
     "multiview": 7,

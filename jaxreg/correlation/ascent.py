@@ -1,0 +1,139 @@
+"""The pose of the largest kernel correlation, by damped Newton steps.
+
+The exact Hessian costs no second pass over the pairs, so Newton's method needs few
+passes. From 36 starts each (asymmetric surface, 300 and 400 points, bandwidth 0.1 to
+0.4 radii, 0.3 to 1.3 rad away) the median was 5 to 16 passes, against 60 to 80 steps,
+each with at least one pass, of optimistix' BFGS on a twist around the pose, and 130
+to 450 of the fixed point that fits the source to the kernel-weighted means of the
+target (EM-ICP's step). The maxima were the same up to 0.8 rad; farther away Newton
+found the better one as often as BFGS or more often.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.typing import Motion, Scalar
+from jaxreg.cloud import PointCloud
+from jaxreg.correlation.quadratic import Quadratic
+from jaxreg.geometry import lie
+from jaxreg.local import turn_and_shift
+
+
+_FIRST_DAMPING = 0.1
+_LEAST_DAMPING = 1e-3
+# Curvature in terms of the stiffness below which a direction is taken as free.
+_FREE = 1e-3
+
+
+class Ascent(eqx.Module):
+    """Where the steps ended.
+
+    Attributes:
+        T_target_source: the best pose.
+        num_steps: passes over the pairs.
+        moving: whether the steps ran out.
+    """
+
+    T_target_source: Float[Array, "D D"]
+    num_steps: Int[Array, ""]
+    moving: Bool[Array, ""]
+
+
+class _State(eqx.Module):
+    """`model` belongs to `T`, the best pose so far; `trial` is looked at next."""
+
+    T: Float[Array, "D D"]
+    model: Quadratic
+    trial: Float[Array, "D D"]
+    damping: Float[Array, ""]
+    num_steps: Int[Array, ""]
+    moving: Bool[Array, ""]
+
+
+def ascend(
+    source: PointCloud,
+    target: PointCloud,
+    init: Motion,
+    bandwidth: Scalar,
+    max_steps: int,
+    tolerance: Scalar,
+) -> Ascent:
+    """Steps until one is smaller than `tolerance`; the correlation never falls.
+
+    Gradients: none; see `newton_step`.
+    """
+
+    def body(state: _State) -> _State:
+        model = Quadratic.at(state.trial, source, target, bandwidth)
+        # Equal up to the rounding of a sum counts as better.
+        slack = 16 * jnp.finfo(init.dtype).eps
+        better = model.correlation >= (1 - slack) * state.model.correlation
+        T, model = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old),
+            (state.trial, model),
+            (state.T, state.model),
+        )
+        damping = jnp.where(better, state.damping / 10, 10 * state.damping)
+        damping = jnp.maximum(damping, _LEAST_DAMPING)
+        tangent = _damped_step(model, damping)
+        return _State(
+            T=T,
+            model=model,
+            trial=lie.orthonormalise(turn_and_shift(T, tangent)),
+            damping=damping,
+            num_steps=state.num_steps + 1,
+            moving=jnp.max(jnp.abs(tangent)) > tolerance,
+        )
+
+    shapes = jax.eval_shape(lambda: Quadratic.at(init, source, target, bandwidth))
+    start = _State(
+        T=init,
+        model=jax.tree.map(lambda x: jnp.full(x.shape, -1, x.dtype), shapes),
+        trial=init,
+        damping=jnp.asarray(10 * _FIRST_DAMPING, init.dtype),
+        num_steps=jnp.zeros((), jnp.int32),
+        moving=jnp.asarray(True),
+    )
+    end = lax.while_loop(lambda s: s.moving & (s.num_steps < max_steps), body, start)
+    return Ascent(end.T, end.num_steps, end.moving)
+
+
+def newton_step(model: Quadratic, b: Float[Array, " k"]) -> Float[Array, " k"]:
+    """The undamped step H^-1 b; free directions are left alone.
+
+    At a maximum with H held, its derivative with respect to what b depends on is that
+    of the maximiser (implicit function theorem).
+
+    Args:
+        model: gives H.
+        b: `(k,)` the model's own, with the derivative that the step is to carry.
+    """
+    curvature, vector, unit = _principal(model)
+    held = curvature > _FREE
+    along = jnp.sum(vector * (unit * b)[:, None], axis=0)
+    along = jnp.where(held, along / jnp.where(held, curvature, 1), 0)
+    return unit * jnp.sum(vector * along, axis=1)
+
+
+def is_free(model: Quadratic) -> Bool[Array, ""]:
+    """Whether the correlation leaves a direction of the motion free, or rises in it."""
+    return jnp.min(_principal(model)[0]) < _FREE
+
+
+def _damped_step(model: Quadratic, damping: Float[Array, ""]) -> Float[Array, " k"]:
+    # The absolute curvature: uphill also where the correlation is not concave.
+    curvature, vector, unit = _principal(model)
+    along = jnp.sum(vector * (unit * model.b)[:, None], axis=0)
+    along = along / (jnp.abs(curvature) + damping)
+    return unit * jnp.sum(vector * along, axis=1)
+
+
+def _principal(model: Quadratic) -> tuple[Array, Array, Array]:
+    """Curvatures and directions in units in which the stiffness is one, and those."""
+    stiff = model.stiffness > 0
+    unit = jnp.where(stiff, 1 / jnp.sqrt(jnp.where(stiff, model.stiffness, 1)), 0)
+    curvature, vector = jnp.linalg.eigh(model.H * unit[:, None] * unit)
+    return curvature, vector, unit
