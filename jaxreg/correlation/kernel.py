@@ -185,10 +185,8 @@ def _covariance(
     bandwidth: Float[Array, ""],
 ) -> Float[Array, "k k"]:
     """Huber's sandwich over the points of both sets."""
-    pulls = [
-        model.by_source,
-        pull_on_target(T_target_source, source, target, bandwidth),
-    ]
-    meat = sum(jnp.matmul(g, g.T, precision=lax.Precision.HIGHEST) for g in pulls)
+    by_target = pull_on_target(T_target_source, source, target, bandwidth)
+    pulls = jnp.concatenate([model.by_source, by_target], axis=1)
+    meat = jnp.matmul(pulls, pulls.T, precision=lax.Precision.HIGHEST)
     half = jax.vmap(solve_semidefinite, (None, 1), 1)(model.H, meat)
     return jax.vmap(solve_semidefinite, (None, 1), 1)(model.H, half.T)

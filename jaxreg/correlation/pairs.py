@@ -12,8 +12,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxreg._core.typing import Mask, Points
-
 
 # Pairs of a tile: their kernel values stay in a CPU's second cache.
 _PAIRS = 1 << 16
@@ -38,8 +36,8 @@ class PairSums(eqx.Module):
 def pair_sums(
     at: Float[Array, "d n"],
     at_mask: Bool[Array, " n"],
-    others: Points,
-    others_mask: Mask,
+    others: Float[Array, "m d"],
+    others_mask: Bool[Array, " m"],
     bandwidth: Float[Array, ""],
 ) -> PairSums:
     """Moments of the kernel around each point, in O(n + m) memory and O(n m) time.
@@ -80,11 +78,11 @@ def pair_sums(
 
 
 def kernel_correlation(
-    source: Points,
-    target: Points,
+    source: Float[Array, "n d"],
+    target: Float[Array, "m d"],
     bandwidth: Float[Array, ""] | float,
-    source_mask: Mask | None = None,
-    target_mask: Mask | None = None,
+    source_mask: Bool[Array, " n"] | None = None,
+    target_mask: Bool[Array, " m"] | None = None,
 ) -> Float[Array, ""]:
     """The sum of exp(-|p - q|^2 / (2 bandwidth^2)) over all pairs of valid points.
 
