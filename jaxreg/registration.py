@@ -20,7 +20,7 @@ from jaxreg._core.typing import Key
 from jaxreg.cloud import centroid, rms_radius
 from jaxreg.geometry import lie
 from jaxreg.local import AbstractRegistrar, Curvature, Modes, RegistrationSolution
-from jaxreg.particle import ParticleFilter
+from jaxreg.particle import AbstractSearch, ParticleFilter
 
 
 def register(
@@ -153,11 +153,18 @@ def _register_pair(
     radius = jnp.where(radius > 0, radius, 1)
     d = source.shape[1]
     eye = jnp.eye(d, dtype=source.dtype)
-    if init is not None:
-        R = lie.rotation(init)
-        shift = R @ source_mean + lie.translation(init) - target_mean
-        init = lie.compose(R, shift / radius)
-    solution = method.in_unit(radius).solve(
+
+    def centred(T: Array) -> Array:
+        """From the frames of the input to the centred and scaled ones."""
+        R = lie.rotation(T).astype(source.dtype)
+        shift = R @ source_mean + lie.translation(T).astype(source.dtype) - target_mean
+        return lie.compose(R, shift / radius)
+
+    method = method.in_unit(radius)
+    if isinstance(method, AbstractSearch):
+        method = method.in_frames(centred, d)
+    init = None if init is None else centred(init)
+    solution = method.solve(
         method.prepare((source - source_mean) / radius, source_mask),
         method.prepare((target - target_mean) / radius, target_mask),
         init,

@@ -10,12 +10,7 @@ from jaxreg.particle.state import Particles
 
 
 def distinct_modes(
-    particles: Particles,
-    weight: Float[Array, " p"],
-    num_modes: int,
-    *,
-    angle: Scalar,
-    distance: Scalar,
+    particles: Particles, num_modes: int, *, angle: Scalar, distance: Scalar
 ) -> tuple[Int[Array, " q"], Float[Array, " q"]]:
     """Rows of the best particles that differ from one another, and their weights.
 
@@ -25,15 +20,18 @@ def distinct_modes(
     """
     T = particles.T_target_source
     R, t = lie.rotation(T), lie.translation(T)
+    weight = jnp.exp(particles.log_weight)
 
     def pick(free: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         best = jnp.argmin(jnp.where(free, particles.energy, jnp.inf))
         turn = lie.rotation_angle(jnp.einsum("pij,kj->pik", R, R[best]))
         shift = jnp.sqrt(jnp.sum((t - t[best]) ** 2, axis=-1))
         same = free & (turn < angle) & (shift < distance)
-        mass = jnp.sum(jnp.where(same, weight, 0))
+        # A mode in use has a weight, though that of its particles may underflow.
+        tiny = jnp.finfo(weight.dtype).tiny
+        mass = jnp.maximum(jnp.sum(jnp.where(same, weight, 0)), tiny)
         return free & ~same, (best, jnp.where(jnp.any(free), mass, 0))
 
-    free = jnp.isfinite(particles.energy)
+    free = jnp.isfinite(particles.energy) & (particles.log_weight > -jnp.inf)
     _, (rows, mass) = lax.scan(pick, free, None, length=num_modes)
     return jnp.where(mass > 0, rows, rows[0]).astype(jnp.int32), mass

@@ -1,0 +1,172 @@
+"""The contract of global searches: draw poses, descend, conclude."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.arrays import cast_floats
+from jaxreg._core.checks import check_key, is_concrete
+from jaxreg._core.typing import Key, Mask, Motion, Points
+from jaxreg.cloud import PointCloud, thin
+from jaxreg.local import (
+    AbstractRegistrar,
+    AbstractResidual,
+    AbstractStep,
+    LocalOptimiser,
+    Problem,
+    RegistrationSolution,
+)
+from jaxreg.neighbours import AbstractIndex, VoxelTable
+from jaxreg.particle.conclude import Pair, conclude
+from jaxreg.particle.priors import AbstractPrior, GaussianPrior, UniformPrior
+from jaxreg.particle.state import Particles
+from jaxreg.robust import AbstractKernel
+
+
+# The agreement of normals decides what is believed: the careful estimate.
+_NORMAL_NEIGHBOURS = 10
+
+
+class Found(eqx.Module):
+    """What a search ended with.
+
+    Attributes:
+        particles: measured poses, with energies and weights.
+        num_steps: int32, steps of the local optimiser along the path of one of them.
+        finished: whether they had come to rest.
+    """
+
+    particles: Particles
+    num_steps: Int[Array, ""]
+    finished: Bool[Array, ""]
+
+
+class AbstractSearch(AbstractRegistrar):
+    """A registration method that needs no initial guess: many poses, few points."""
+
+    prior: eqx.AbstractVar[AbstractPrior | None]
+    residual: eqx.AbstractVar[AbstractResidual]
+    kernel: eqx.AbstractVar[AbstractKernel]
+    step: eqx.AbstractVar[AbstractStep]
+    width_start: eqx.AbstractVar[Array | float]
+    width_end: eqx.AbstractVar[Array | float]
+    min_overlap: eqx.AbstractVar[Array | float]
+    num_points: eqx.AbstractVar[int]
+    num_modes: eqx.AbstractVar[int]
+    refine_steps: eqx.AbstractVar[int]
+    max_points: eqx.AbstractVar[int]
+    batch_size: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
+        """Searches on the points of the problem."""
+
+    def in_frames(
+        self, centred: Callable[[Motion], Motion], d: int
+    ) -> "AbstractSearch":
+        """With poses given in the frames of the input in those of `solve`.
+
+        Args:
+            centred: maps a pose from the former to the latter.
+            d: dimension of the points.
+        """
+        if self.prior is None:
+            return self
+        return eqx.tree_at(lambda m: m.prior, self, self.prior.in_frames(centred, d))
+
+    def prepare(self, points: Points, mask: Mask) -> PointCloud:
+        """Thinned to `max_points`, with normals."""
+        return thin(points, mask, self.max_points, _NORMAL_NEIGHBOURS)
+
+    def solve(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        init: Motion | None,
+        key: Key | None,
+    ) -> RegistrationSolution:
+        """Searches, refines and scores in the prepared frames."""
+        key = check_key(key)
+        if key.ndim:
+            raise ValueError(f"key: wanted one key, found shape {key.shape}.")
+        target_index = VoxelTable.build(target.points, target.mask)
+        source_index = VoxelTable.build(source.points, source.mask)
+        return self.solve_indexed(source, target, source_index, target_index, init, key)
+
+    def solve_indexed(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        source_index: AbstractIndex,
+        target_index: AbstractIndex,
+        init: Motion | None,
+        key: Key,
+    ) -> RegistrationSolution:
+        """`solve` with indexes built before, for clouds that enter many pairs."""
+        self = cast_floats(self, source.points.dtype)
+        key_points, key_search = jax.random.split(key)
+        pair = Pair(source, target, source_index, target_index)
+        few = _some_points(key_points, pair.problem, self.num_points)
+        found = self.search(key_search, few, init)
+        return conclude(
+            pair,
+            found.particles,
+            found.num_steps,
+            found.finished,
+            kernel=self.kernel,
+            num_modes=self.num_modes,
+            refine_steps=self.refine_steps,
+            min_overlap=self.min_overlap,
+        )
+
+    def _optimiser(self, dtype: Any) -> LocalOptimiser:
+        optimiser = LocalOptimiser(self.residual, self.kernel, self.step)
+        return cast_floats(optimiser, dtype)
+
+    def _start(
+        self, key: Key, num: int, init: Motion | None, dtype: Any, d: int
+    ) -> Float[Array, "p D D"]:
+        """`num` poses of the prior and as many more as fill the last block."""
+        prior = self.prior
+        if prior is None:
+            prior = UniformPrior() if init is None else GaussianPrior()
+        T = cast_floats(prior, dtype).draw(key, num, d, init, dtype)
+        batch = min(self.batch_size, num)
+        surplus = -num % batch
+        return jnp.concatenate([T, T[:surplus]]) if surplus else T
+
+
+def check_counts(method: eqx.Module, least: dict[str, int]) -> None:
+    """Requires counts, given with their least values."""
+    for name, low in least.items():
+        found = getattr(method, name)
+        if isinstance(found, bool) or not isinstance(found, int) or found < low:
+            raise ValueError(
+                f"{type(method).__name__}: {name} must be an integer of at least "
+                f"{low}, found {found!r}."
+            )
+
+
+def check_positive(method: eqx.Module, names: tuple[str, ...]) -> None:
+    """Requires positive numbers, where their values are known."""
+    for name in names:
+        value = getattr(method, name)
+        if is_concrete(value) and not float(value) > 0:
+            raise ValueError(
+                f"{type(method).__name__}: {name} must be positive, found "
+                f"{float(value)}."
+            )
+
+
+def _some_points(key: Key, problem: Problem, num: int) -> Problem:
+    """The problem on a random subset of the valid source points."""
+    if problem.source.shape[1] <= num:
+        return problem
+    order = jax.random.uniform(key, problem.source_mask.shape, problem.source.dtype)
+    rows = jnp.argsort(jnp.where(problem.source_mask, order, 2))[:num]
+    return problem.of_rows(rows)

@@ -1,0 +1,159 @@
+"""From many measured poses to an answer: modes, refinement, scores, status."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.arrays import cast_floats
+from jaxreg._core.status import Status
+from jaxreg._core.typing import Motion, Scalar
+from jaxreg.cloud import PointCloud, median_spacing
+from jaxreg.geometry import lie
+from jaxreg.local import (
+    Curvature,
+    GaussNewton,
+    LocalOptimiser,
+    Modes,
+    PointToPlane,
+    Problem,
+    RegistrationSolution,
+    match,
+    score_both_ways,
+)
+from jaxreg.neighbours import AbstractIndex
+from jaxreg.particle.modes import distinct_modes
+from jaxreg.particle.state import Particles
+from jaxreg.robust import AbstractKernel
+
+
+# Poses nearer than this, in radians and radii, are one mode.
+_APART = 0.3
+# A second mode with more than this share of the overlap of the first is its rival.
+_RIVAL = 0.95
+
+
+class Pair(eqx.Module):
+    """Two prepared clouds with their indexes."""
+
+    source: PointCloud
+    target: PointCloud
+    source_index: AbstractIndex
+    target_index: AbstractIndex
+
+    @property
+    def problem(self) -> Problem:
+        """The source to be registered to the target, all points."""
+        return Problem.of(self.source, self.target, self.target_index)
+
+    @property
+    def spacing(self) -> Scalar:
+        """Between samples of the coarser cloud."""
+        return jnp.maximum(
+            median_spacing(self.target.points, self.target.mask),
+            median_spacing(self.source.points, self.source.mask),
+        )
+
+
+def conclude(
+    pair: Pair,
+    particles: Particles,
+    num_steps: Int[Array, ""],
+    finished: Bool[Array, ""],
+    *,
+    kernel: AbstractKernel,
+    num_modes: int,
+    refine_steps: int,
+    min_overlap: Array | float,
+) -> RegistrationSolution:
+    """The solution of a search.
+
+    Args:
+        pair: what was searched.
+        particles: measured and weighted poses.
+        num_steps: steps of the local optimiser that led to them.
+        finished: whether they had come to rest.
+        kernel: of the refinement.
+        num_modes: distinct poses to refine and score.
+        refine_steps: steps on all points; the modes are then ordered by the overlap
+            that they reach. Without, by energy: the answer is the particle of least
+            energy.
+        min_overlap: share of both clouds that must agree.
+    """
+    dtype = particles.energy.dtype
+    limit = jnp.asarray(_APART, dtype)
+    rows, mass = distinct_modes(particles, num_modes, angle=limit, distance=limit)
+    optimiser = cast_floats(
+        LocalOptimiser(PointToPlane(), kernel, GaussNewton()), dtype
+    )
+    spacing = pair.spacing
+    T_modes = particles.T_target_source[rows]
+    if refine_steps:
+        T_modes = _refine(pair.problem, optimiser, T_modes, spacing, refine_steps)
+    T_modes = lie.orthonormalise(T_modes)
+    sound = jnp.all(jnp.isfinite(T_modes), axis=(1, 2)) & (mass > 0)
+    eye = lie.identity(T_modes.shape[-1] - 1, dtype)
+    T_modes = jnp.where(sound[:, None, None], T_modes, eye)
+
+    there, back = lax.map(
+        lambda T: score_both_ways(
+            pair.source, pair.target, pair.source_index, pair.target_index, T, spacing
+        ),
+        T_modes,
+    )
+    overlap = jnp.where(sound, jnp.minimum(there.fitness, back.fitness), -1)
+    order = jnp.argsort(-overlap) if refine_steps else jnp.arange(num_modes)
+    best = order[0]
+    T = T_modes[best]
+    status = _status(overlap[order], pair, min_overlap, finished | (refine_steps > 0))
+    found = match(pair.problem, T)
+    weight = optimiser.weights(found, 0.5 * spacing)
+    curvature = Curvature.of(optimiser.residual, found, weight)
+    return RegistrationSolution(
+        T_target_source=T,
+        status=status,
+        fitness=there.fitness[best],
+        inlier_rmse=there.inlier_rmse[best],
+        num_inliers=there.num_inliers[best],
+        overlap=jnp.maximum(overlap[best], 0),
+        num_steps=(num_steps + refine_steps).astype(jnp.int32),
+        H=curvature.H,
+        b=curvature.b,
+        error=curvature.error,
+        covariance=curvature.covariance,
+        modes=Modes(T_modes[order], mass[order], there.fitness[order]),
+    )
+
+
+def _refine(
+    problem: Problem,
+    optimiser: LocalOptimiser,
+    T: Float[Array, "q D D"],
+    spacing: Scalar,
+    num_steps: int,
+) -> Float[Array, "q D D"]:
+    """Many steps on all points, the width falling to the sample spacing."""
+    widths = spacing * jnp.geomspace(2, 0.5, num_steps, dtype=T.dtype)
+
+    def one(T: Motion) -> Motion:
+        return optimiser.repeat(problem, T, widths)
+
+    return lax.map(one, T)
+
+
+def _status(
+    overlap: Float[Array, " q"],
+    pair: Pair,
+    min_overlap: Array | float,
+    finished: Bool[Array, ""],
+) -> Int[Array, ""]:
+    """Of modes with the answer first; an overlap of -1 marks one that is no pose."""
+    status = jnp.where(finished, Status.CONVERGED, Status.MAX_STEPS)
+    if overlap.shape[0] > 1:
+        rival = jnp.max(overlap[1:]) > _RIVAL * overlap[0]
+        status = jnp.where(rival, Status.AMBIGUOUS, status)
+    status = jnp.where(overlap[0] < min_overlap, Status.LOW_OVERLAP, status)
+    status = jnp.where(overlap[0] < 0, Status.NON_FINITE, status)
+    d = pair.source.points.shape[1]
+    few = jnp.minimum(jnp.sum(pair.source.mask), jnp.sum(pair.target.mask)) < d + 1
+    return jnp.where(few, Status.TOO_FEW_POINTS, status).astype(jnp.int32)

@@ -1,0 +1,33 @@
+"""The contract of energies."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg._core.typing import Scalar
+from jaxreg.local import Match
+
+
+class AbstractEnergy(eqx.Module):
+    """E of p(z_t | x_t) = exp(-E / temperature) (PF paper, section 3.3, step 2).
+
+    The paper prints the exponent without its minus. Energies are means over the valid
+    source points, so that their number does not matter; the temperature is learned.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, found: Match, width: Scalar) -> Scalar:
+        """Of the correspondences at a pose.
+
+        Args:
+            found: the match at the pose.
+            width: kernel width of the present time, in the unit of the match.
+        """
+
+
+def mean_over_source(value: Float[Array, " n"], found: Match) -> Float[Array, ""]:
+    """The mean over the valid source points; zero where there are none."""
+    total = jnp.maximum(jnp.sum(found.mask), 1).astype(value.dtype)
+    return jnp.sum(jnp.where(found.mask, value, 0)) / total

@@ -1,0 +1,110 @@
+"""`MultiStart`: many local descents, all kept. What the filter is measured against."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jaxreg._core.arrays import traced
+from jaxreg._core.typing import Key, Motion
+from jaxreg.local import (
+    AbstractResidual,
+    AbstractStep,
+    GaussNewton,
+    PointToPlane,
+    Problem,
+    decoupled_error,
+    match,
+)
+from jaxreg.particle.base import AbstractSearch, Found, check_counts, check_positive
+from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy
+from jaxreg.particle.priors import AbstractPrior, GivenParticles
+from jaxreg.particle.state import Particles
+from jaxreg.robust import AbstractKernel, GemanMcClure
+
+
+class MultiStart(AbstractSearch):
+    """Global registration by descents from poses drawn from the prior.
+
+    The parts are those of `ParticleFilter`, without resampling and dynamics, and the
+    end is the same: distinct modes, refined and scored. One search looks up
+    `num_points * num_starts * (num_steps + 1)` closest points, by default exactly as
+    many as `ParticleFilter()`.
+
+    Attributes:
+        num_starts: poses drawn from the prior.
+        num_steps: local steps from each.
+        refine_steps, num_points, num_modes, max_points, batch_size: as in
+            `ParticleFilter`.
+        prior, energy, residual, kernel, step: as there. The energy ranks the ends, of
+            which a mode's weight is its share.
+        width_start, width_end: kernel width at the first and at the last step.
+        tolerance: descents have come to rest where the last step moves none by more
+            than this many radians and radii.
+        min_overlap: share of both clouds that must agree for a pose to be believed.
+
+    Raises: ValueError while constructing, for counts that leave nothing to do.
+
+    Fails: as `ParticleFilter`.
+
+    Gradients: none; refine with `ICP` from the answer to differentiate it.
+    """
+
+    num_starts: int = eqx.field(default=512, static=True)
+    num_steps: int = eqx.field(default=27, static=True)
+    refine_steps: int = eqx.field(default=24, static=True)
+    num_points: int = eqx.field(default=400, static=True)
+    num_modes: int = eqx.field(default=4, static=True)
+    max_points: int = eqx.field(default=4096, static=True)
+    batch_size: int = eqx.field(default=32, static=True)
+    prior: AbstractPrior | None = None
+    energy: AbstractEnergy = eqx.field(default_factory=BoundedEnergy)
+    residual: AbstractResidual = eqx.field(default_factory=lambda: PointToPlane(0.2))
+    kernel: AbstractKernel = eqx.field(default_factory=GemanMcClure)
+    step: AbstractStep = eqx.field(default_factory=GaussNewton)
+    width_start: Array | float = traced(0.3)
+    width_end: Array | float = traced(0.06)
+    tolerance: Array | float = traced(1e-4)
+    min_overlap: Array | float = traced(0.12)
+
+    def __check_init__(self) -> None:
+        """Refuses counts that leave nothing to do."""
+        names = "num_starts num_steps num_points num_modes max_points batch_size"
+        check_counts(self, {**dict.fromkeys(names.split(), 1), "refine_steps": 0})
+        check_positive(self, ("width_start", "width_end"))
+        if isinstance(self.prior, GivenParticles):
+            self.prior.check_number(self.num_starts, "num_starts")
+
+    def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
+        """Descends from every start, the width falling to `width_end`."""
+        d, dtype = problem.source.shape[0], problem.source.dtype
+        T = self._start(key, self.num_starts, init, dtype, d)
+        optimiser = self._optimiser(dtype)
+        share = jnp.linspace(0, 1, self.num_steps, dtype=dtype)
+        widths = self.width_start * (self.width_end / self.width_start) ** share
+
+        def one(T: Array) -> tuple[Array, Array, Array]:
+            def step(carry: tuple[Array, Array], width: Array) -> tuple:
+                T, _ = carry
+                return (optimiser(problem, T, width), T), None
+
+            T, T_before = lax.scan(step, (T, T), widths)[0]
+            return (
+                T,
+                decoupled_error(T, T_before),
+                self.energy(match(problem, T), widths[-1]),
+            )
+
+        batch = min(self.batch_size, self.num_starts)
+        blocks = T.reshape(-1, batch, *T.shape[1:])
+        ends = lax.map(jax.vmap(one), blocks)
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), ends)
+        found = jax.tree.map(lambda x: x[: self.num_starts], flat)
+        particles = eqx.tree_at(
+            lambda p: (p.T_target_source, p.motion_error, p.energy),
+            Particles.at(T[: self.num_starts], self.num_starts),
+            found,
+        )
+        finished = jnp.max(jnp.abs(particles.motion_error)) <= self.tolerance
+        return Found(particles, jnp.asarray(self.num_steps, jnp.int32), finished)

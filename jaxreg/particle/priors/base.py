@@ -1,0 +1,41 @@
+"""The contract of priors."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from jaxreg._core.checks import is_concrete
+from jaxreg._core.typing import Key, Motion
+
+
+class AbstractPrior(eqx.Module):
+    """pi_0: where the particles are at t = 0 (PF paper, section 4.2)."""
+
+    @abc.abstractmethod
+    def draw(
+        self, key: Key, num: int, d: int, init: Motion | None, dtype: Any
+    ) -> Float[Array, "p D D"]:
+        """`num` poses in the frames of the search.
+
+        Args:
+            key: randomness.
+            num: how many.
+            d: dimension of the points.
+            init: the initial guess, if there is one.
+            dtype: of the result.
+        """
+
+    def in_frames(self, centred: Callable[[Motion], Motion], d: int) -> "AbstractPrior":
+        """The prior with its poses, if it holds any, in the frames of the search."""
+        return self
+
+
+def check_spread(prior: object, name: str, spread: Array | float) -> None:
+    """Requires a spread that is not negative, where its value is known."""
+    if is_concrete(spread) and not float(spread) >= 0:
+        raise ValueError(
+            f"{type(prior).__name__}: {name} must be at least 0, found {float(spread)}."
+        )

@@ -1,0 +1,54 @@
+"""Around a guess."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg._core.arrays import traced
+from jaxreg._core.checks import is_concrete
+from jaxreg._core.typing import Key, Motion
+from jaxreg.geometry import lie
+from jaxreg.local import turn_and_shift
+from jaxreg.particle.priors.base import AbstractPrior, check_spread
+
+
+class GaussianPrior(AbstractPrior):
+    """x_0 ~ N(init, diag(spread^2)) in the tangent space; the first is `init`.
+
+    Without an initial guess, around the identity of the centred clouds.
+
+    Attributes:
+        translation_spread: deviation in each direction, in root mean square radii of
+            the target.
+        rotation_spread: deviation about each axis, in radians.
+
+    Raises: ValueError for negative spreads and where both are zero: then all particles
+        are one.
+    """
+
+    translation_spread: Array | float = traced(0.3)
+    rotation_spread: Array | float = traced(0.3)
+
+    def __check_init__(self) -> None:
+        """Refuses spreads that leave a single pose."""
+        both = (self.translation_spread, self.rotation_spread)
+        check_spread(self, "translation_spread", both[0])
+        check_spread(self, "rotation_spread", both[1])
+        if all(is_concrete(s) and float(s) == 0 for s in both):
+            raise ValueError(
+                "GaussianPrior: translation_spread and rotation_spread are both 0, "
+                "which leaves one particle; use ICP from the guess."
+            )
+
+    def draw(
+        self, key: Key, num: int, d: int, init: Motion | None, dtype: Any
+    ) -> Float[Array, "p D D"]:
+        """`(num, d+1, d+1)` poses."""
+        k = lie.tangent_dim(d)
+        init = lie.identity(d, dtype) if init is None else init
+        translates = jnp.arange(k) < d
+        spread = jnp.where(translates, self.translation_spread, self.rotation_spread)
+        tangent = spread.astype(dtype) * jax.random.normal(key, (num, k), dtype)
+        return jax.vmap(turn_and_shift, (None, 0))(init, tangent.at[0].set(0))
