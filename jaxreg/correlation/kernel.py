@@ -129,7 +129,7 @@ class KernelCorrelation(AbstractRegistrar):
             median_spacing(source.points, source.mask),
             median_spacing(target.points, target.mask),
         )
-        width = self._width(spacing)
+        width = self.width(spacing)
         fixed = lax.stop_gradient((source, target, init, width, self.tolerance))
         end = ascend(*fixed[:4], self.max_steps, jnp.asarray(fixed[4]))
 
@@ -161,8 +161,12 @@ class KernelCorrelation(AbstractRegistrar):
             modes=Modes(T[None], jnp.ones(1, dtype), there.fitness[None]),
         )
 
-    def _width(self, spacing: Float[Array, ""]) -> Float[Array, ""]:
-        """The bandwidth in the prepared frames, where the target's radius is one."""
+    def width(self, spacing: Float[Array, ""]) -> Float[Array, ""]:
+        """The bandwidth in the prepared frames, where the target's radius is one.
+
+        Args:
+            spacing: of the coarser cloud's samples, there.
+        """
         if self.bandwidth is None:
             return jnp.maximum(_RADII, _SPACINGS * spacing)
         return jnp.asarray(self.bandwidth)
