@@ -24,6 +24,7 @@ def normalised(
     usable = jnp.where(jnp.any(usable), usable, live)
     level = jnp.where(jnp.isfinite(log_weight), log_weight, 0)
     level = jnp.where(usable, level, -jnp.inf)
+    level = level - jnp.max(level)  # before rounding takes its digits
     return level - jax.nn.logsumexp(level)
 
 

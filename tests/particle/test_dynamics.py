@@ -1,0 +1,108 @@
+"""Dynamics: Eq. 6-8 as moments of many draws."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import motion
+from jaxtyping import TypeCheckError
+
+from jaxreg.local import decoupled_error, turn_and_shift
+from jaxreg.particle import (
+    ConstantVelocity,
+    NoDynamics,
+    Particles,
+    StochasticDynamics,
+)
+
+
+P, DRAWS, TIME = 3, 4000, 2
+RNG = np.random.default_rng(0)
+ERROR = 0.1 * RNG.standard_normal((P, 6))
+PATH = 0.1 * RNG.standard_normal((P, 4, 6))
+PATH[:, TIME:] = 0
+WEIGHT = np.array([0.6, 0.4, 0.0])
+
+
+def _particles(num: int = P) -> Particles:
+    rows = np.arange(num) % P
+    T = np.stack([motion(i, 3) for i in range(P)])
+    return Particles(
+        jnp.asarray(T[rows], jnp.float32),
+        jnp.asarray(ERROR[rows], jnp.float32),
+        jnp.zeros(num, jnp.float32),
+        jnp.log(jnp.asarray(WEIGHT[rows] * P / num, jnp.float32)),
+        jnp.asarray(PATH[rows], jnp.float32),
+    )
+
+
+def _steps(dynamics) -> np.ndarray:
+    """`(draws, P, 6)` tangents from the particles to their predictions."""
+    particles = _particles(P * DRAWS)
+    T = dynamics(jax.random.key(0), particles, jnp.asarray(TIME))
+    step = jax.vmap(decoupled_error)(T, particles.T_target_source)
+    return np.asarray(step, np.float64).reshape(DRAWS, P, 6)
+
+
+def test_without_dynamics_particles_stay():
+    particles = _particles()
+    T = NoDynamics()(jax.random.key(0), particles, jnp.asarray(TIME))
+    np.testing.assert_array_equal(T, particles.T_target_source)
+
+
+def test_constant_velocity_repeats_the_motion_error():
+    particles = _particles()
+    first = ConstantVelocity()(jax.random.key(0), particles, jnp.asarray(TIME))
+    again = ConstantVelocity()(jax.random.key(1), particles, jnp.asarray(TIME))
+    np.testing.assert_array_equal(first, again)
+    step = jax.vmap(decoupled_error)(first, particles.T_target_source)
+    np.testing.assert_allclose(step, ERROR, atol=1e-6)
+
+
+@pytest.mark.parametrize("spread", ["own", "ensemble", "path"])
+def test_the_diffusion_has_the_covariance_of_the_motion_error(spread):
+    outer = ERROR[:, :, None] * ERROR[:, None, :]
+    S = {
+        "own": outer,
+        "ensemble": np.tensordot(WEIGHT, outer, 1)[None].repeat(P, 0),
+        "path": np.einsum("pti,ptj->pij", PATH, PATH) / TIME,
+    }[spread]
+    step = _steps(StochasticDynamics(0.5, spread))
+    size = np.abs(S).max()
+    np.testing.assert_allclose(step.mean(0), 0, atol=0.05 * np.sqrt(size))
+    found = np.einsum("spi,spj->pij", step, step) / DRAWS
+    np.testing.assert_allclose(found, 0.25 * S, atol=0.03 * size)
+
+
+@pytest.mark.parametrize("spread", ["own", "ensemble", "path"])
+def test_the_diffusion_dies_with_the_motion_error(spread):
+    T = jnp.asarray(np.stack([motion(i, 2) for i in range(P)]), jnp.float32)
+    still = Particles.at(T, P, num_times=3)
+    dynamics = StochasticDynamics(spread=spread)
+    moved = dynamics(jax.random.key(0), still, jnp.asarray(0))
+    np.testing.assert_allclose(moved, T, atol=1e-6)
+    assert dynamics.needs_path == (spread == "path")
+
+
+def test_the_ensemble_ignores_particles_without_weight():
+    particles = _particles()
+    broken = jax.tree.map(lambda x: x, particles)
+    broken = Particles(
+        broken.T_target_source,
+        broken.motion_error.at[2].set(jnp.nan),
+        broken.energy,
+        broken.log_weight,
+    )
+    T = StochasticDynamics(spread="ensemble")(jax.random.key(0), broken, jnp.asarray(1))
+    assert np.isfinite(np.asarray(T)).all()
+
+
+def test_the_motion_error_is_a_left_tangent_about_the_centroid():
+    T, e = jnp.asarray(motion(0, 3), jnp.float32), jnp.asarray(ERROR[0], jnp.float32)
+    np.testing.assert_allclose(decoupled_error(turn_and_shift(T, e), T), e, atol=1e-6)
+
+
+def test_an_unknown_spread_is_refused():
+    # The run-time check of types, where it is on, comes first.
+    with pytest.raises((ValueError, TypeCheckError), match="spread"):
+        StochasticDynamics(spread="all")  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,113 @@
+"""Energies against NumPy in float64, and what a measurement does."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import blob, motion
+from scipy.spatial import KDTree
+
+from jaxreg.cloud import PointCloud
+from jaxreg.local import (
+    GaussNewton,
+    LocalOptimiser,
+    PointToPoint,
+    Problem,
+    decoupled_error,
+    match,
+)
+from jaxreg.neighbours import BruteForce
+from jaxreg.particle import (
+    AbsoluteEnergy,
+    BoundedEnergy,
+    Particles,
+    SquaredEnergy,
+)
+from jaxreg.particle.measure import measure
+from jaxreg.particle.modes import distinct_modes
+from jaxreg.robust import L2
+
+
+N = 128
+RNG = np.random.default_rng(0)
+POINTS = blob(N, 3) - blob(N, 3).mean(0)
+NORMALS = RNG.standard_normal((N, 3))
+NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
+MASK = RNG.random(N) < 0.8
+WIDTH = 0.2
+
+
+def _problem() -> Problem:
+    normals = jnp.asarray(NORMALS, jnp.float32)
+    source = PointCloud(jnp.asarray(POINTS), normals, jnp.asarray(MASK))
+    target = PointCloud(jnp.asarray(POINTS), normals, jnp.ones(N, bool))
+    return Problem.of(source, target, BruteForce.build(target.points))
+
+
+@pytest.mark.parametrize("kind", ["bounded", "squared", "absolute"])
+def test_energies_are_their_equations(kind):
+    T = motion(3, 3, angle=0.3, shift=0.1)
+    moved = POINTS.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+    distance, row = KDTree(POINTS.astype(np.float64)).query(moved)
+    cosine = np.sum((NORMALS @ T[:3, :3].T) * NORMALS[row], 1)
+    energy, value = {
+        "bounded": (
+            BoundedEnergy(),
+            1 - cosine**2 / (1 + distance**2 / WIDTH**2),
+        ),
+        "squared": (SquaredEnergy(), distance**2),
+        "absolute": (AbsoluteEnergy(0.05), np.sqrt(distance**2 + 0.05**2)),
+    }[kind]
+    found = energy(
+        match(_problem(), jnp.asarray(T, jnp.float32)), jnp.asarray(WIDTH, jnp.float32)
+    )
+    assert float(found) == pytest.approx(value[MASK].mean(), rel=1e-4)
+
+
+def test_only_the_bounded_energy_is_bounded():
+    problem, width = _problem(), jnp.asarray(0.1)
+    there, far = (match(problem, jnp.eye(4).at[0, 3].set(x)) for x in (0.0, 1e6))
+    assert abs(float(BoundedEnergy()(there, width))) < 1e-6
+    assert 0.99 < float(BoundedEnergy()(far, width)) <= 1
+    assert float(SquaredEnergy()(far, width)) == pytest.approx(1e12, rel=1e-3)
+    assert float(AbsoluteEnergy()(far, width)) == pytest.approx(1e6, rel=1e-3)
+
+
+def test_measurement_descends_and_reports_what_it_moved():
+    problem, energy = _problem(), SquaredEnergy()
+    optimiser = LocalOptimiser(PointToPoint(), L2(), GaussNewton())
+    T = np.stack([motion(s, 3, angle=0.2, shift=0.05) for s in range(8)])
+    start = Particles.at(jnp.asarray(T, jnp.float32), 8)
+    T = start.T_target_source
+    width = jnp.asarray(0.2)
+    out = measure(
+        problem,
+        optimiser,
+        energy,
+        start,
+        T,
+        width,
+        num_rows=5,
+        num_steps=5,
+        batch_size=2,
+    )
+    before = jax.vmap(lambda T: energy(match(problem, T), width))(T)
+    assert np.all(np.asarray(out.energy)[:6] < np.asarray(before)[:6])
+    np.testing.assert_array_equal(out.energy[6:], np.inf)
+    moved = jax.vmap(decoupled_error)(out.T_target_source, T)
+    np.testing.assert_allclose(out.motion_error, moved, atol=1e-6)
+    best = np.argmin(out.energy)
+    np.testing.assert_array_equal(out.measurement, out.T_target_source[best])
+
+
+def test_modes_are_distinct_best_first_and_share_the_weight():
+    poses = [np.eye(4), motion(1, 3), motion(2, 3)]
+    rows = np.array([0, 1, 0, 2, 1, 0, 2])
+    T = jnp.asarray(np.stack([poses[r] for r in rows]), jnp.float32)
+    value = jnp.asarray([0.3, 0.1, 0.31, 0.9, 0.12, 0.32, 0.01])
+    weight = jnp.asarray([0.1, 0.3, 0.1, 0.05, 0.3, 0.15, 0])
+    particles = Particles(T, jnp.zeros((7, 6)), value, jnp.log(weight))
+    limit = jnp.asarray(0.1)
+    row, mass = distinct_modes(particles, 4, angle=limit, distance=limit)
+    np.testing.assert_array_equal(row[:3], [1, 0, 3])
+    np.testing.assert_allclose(mass, [0.6, 0.35, 0.05, 0], atol=1e-6)

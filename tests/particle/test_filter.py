@@ -1,0 +1,260 @@
+"""The filter, its preset and its rival, on small problems."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import blob, motion, move, pose_error
+from jaxtyping import Array
+
+from jaxreg import Status
+from jaxreg._core.arrays import traced
+from jaxreg.cloud import PointCloud
+from jaxreg.local import LocalOptimiser, match
+from jaxreg.neighbours import BruteForce
+from jaxreg.particle import (
+    AbstractDynamics,
+    BoundedEnergy,
+    ConstantVelocity,
+    GaussianPrior,
+    GivenParticles,
+    MultiStart,
+    NoDynamics,
+    ParticleFilter,
+    SquaredEnergy,
+    StochasticDynamics,
+    Systematic,
+    sandhu2010,
+)
+from jaxreg.particle.conclude import Pair, conclude
+from jaxreg.particle.energies import AbstractEnergy
+from jaxreg.registration import register
+from jaxreg.robust import L2
+
+
+N, P = 96, 24
+KEY = jax.random.key(0)
+STARTS = np.stack([motion(i, 2, shift=0.3) for i in range(P)])
+
+
+def _cloud(points: np.ndarray) -> PointCloud:
+    # On a curve about the origin the radius is nearly the normal.
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    return PointCloud(
+        jnp.asarray(points), jnp.asarray(normals), jnp.ones(len(points), bool)
+    )
+
+
+def _pair(d: int, T: np.ndarray | None = None) -> Pair:
+    T = np.eye(d + 1) if T is None else T
+    points = blob(2 * N, d) - blob(2 * N, d).mean(0)
+    source, target = _cloud(move(np.linalg.inv(T), points[:N])), _cloud(points)
+    indexes = BruteForce.build(source.points), BruteForce.build(target.points)
+    return Pair(source, target, *indexes)
+
+
+@eqx.filter_jit
+def _search(method, problem):
+    return method.search(KEY, problem, None)
+
+
+@eqx.filter_jit
+def _conclude(pair, found):
+    return conclude(
+        pair,
+        found.particles,
+        found.num_steps,
+        found.finished,
+        kernel=L2(),
+        num_modes=2,
+        refine_steps=0,
+        min_overlap=0.12,
+    )
+
+
+def _small(**parts) -> ParticleFilter:
+    settings = {
+        "num_prior": P,
+        "num_particles": P,
+        "num_times": 3,
+        "prior_steps": 2,
+        "inner_steps": 2,
+        "prior": GivenParticles(STARTS),
+        "width_end": 0.3,
+        "batch_size": 10,
+    }
+    return ParticleFilter(**{**settings, **parts})
+
+
+def test_multi_start_keeps_every_single_descent():
+    method = MultiStart(
+        num_starts=P, num_steps=8, prior=GivenParticles(STARTS), batch_size=10
+    )
+    problem = _pair(2).problem
+    found = _search(method, problem).particles
+    optimiser = LocalOptimiser(method.residual, method.kernel, method.step)
+    widths = 0.3 * 0.2 ** jnp.linspace(0, 1, 8)
+    descend = jax.jit(lambda T: optimiser.repeat(problem, T, widths))
+    for i, T in enumerate(STARTS[:12]):
+        end = descend(jnp.asarray(T, jnp.float32))
+        np.testing.assert_allclose(found.T_target_source[i], end, atol=1e-4)
+        value = BoundedEnergy()(match(problem, end), widths[-1])
+        assert float(found.energy[i]) == pytest.approx(float(value), abs=1e-4)
+    np.testing.assert_allclose(np.exp(found.log_weight), 1 / P, rtol=1e-5)
+    best = found.T_target_source[np.argmin(found.energy)]
+    np.testing.assert_array_equal(found.measurement, best)
+
+
+def test_without_dynamics_and_resampling_the_filter_is_multi_start():
+    # Then a particle is one descent of 2 + 3 * 2 steps, and Eq. 9 a product.
+    problem = _pair(2).problem
+    still = _small(dynamics=NoDynamics(), resampler=Systematic(0.0), tolerance=0.0)
+    found = _search(still, problem)
+    rival = MultiStart(
+        num_starts=P,
+        num_steps=8,
+        prior=GivenParticles(STARTS),
+        width_end=0.3,
+        batch_size=10,
+    )
+    ends = _search(rival, problem).particles
+    np.testing.assert_allclose(
+        found.particles.T_target_source, ends.T_target_source, atol=1e-4
+    )
+    np.testing.assert_allclose(found.particles.energy, ends.energy, atol=1e-4)
+    assert int(found.num_steps) == 8
+    # The weight of a particle that fits better at every time grows with time.
+    once = _search(_small(dynamics=NoDynamics(), tolerance=0.0), problem).particles
+    assert np.ptp(found.particles.log_weight) > np.ptp(once.log_weight)
+    assert np.sum(np.exp(found.particles.log_weight)) == pytest.approx(1, abs=1e-4)
+
+
+def _paper(d: int, dynamics: AbstractDynamics, num_times: int) -> ParticleFilter:
+    starts = GaussianPrior(0.5, 0.5).draw(KEY, P, d, None, jnp.float32)
+    prior = GivenParticles(starts)
+    return sandhu2010(d, P, dynamics, prior=prior, num_times=num_times)
+
+
+@pytest.mark.parametrize(
+    ("d", "dynamics"),
+    [(2, StochasticDynamics(spread="path")), (3, StochasticDynamics())],
+)
+def test_the_papers_filter_solves_an_easy_case(d, dynamics):
+    T = motion(4, d, angle=0.6, shift=0.1)
+    pair = _pair(d, T)
+    found = _search(_paper(d, dynamics, 12), pair.problem)
+    solution = _conclude(pair, found)
+    angle, shift = pose_error(solution.T_target_source, T)
+    assert angle < 0.02
+    assert shift < 0.02
+    # Without refinement the answer is the particle of least energy.
+    np.testing.assert_allclose(
+        solution.T_target_source, found.particles.measurement, atol=1e-5
+    )
+    rested = bool(found.finished)
+    expected = Status.CONVERGED if rested else Status.MAX_STEPS
+    assert int(solution.status) == expected
+
+
+def test_the_filter_stops_when_the_motion_errors_are_small():
+    problem = _pair(2).problem
+    method = _paper(2, StochasticDynamics(spread="path"), 12)
+    at = eqx.tree_at(lambda m: m.tolerance, method, jnp.asarray(10.0))
+    found = _search(at, problem)
+    assert int(found.num_steps) == 7 + 7  # t = 0 and t = 1
+    assert bool(found.finished)
+    at = eqx.tree_at(lambda m: m.tolerance, method, jnp.asarray(-1.0))
+    found = _search(at, problem)  # never
+    assert int(found.num_steps) == 7 + 12 * 7
+    assert not bool(found.finished)
+    # At rest from the beginning: the truth is a fixed point.
+    rest = GivenParticles(np.broadcast_to(np.eye(3), (P, 3, 3)))
+    found = _search(eqx.tree_at(lambda m: m.prior, method, rest), problem)
+    assert int(found.num_steps) == 7 + 7
+    assert bool(found.finished)
+
+
+def test_the_papers_settings():
+    flat, solid = sandhu2010(2), sandhu2010(3, 40, ConstantVelocity())
+    assert (flat.inner_steps, solid.inner_steps) == (7, 3)
+    assert (flat.num_prior, solid.num_prior) == (200, 40)
+    assert type(flat.step).__name__ == "GradientDescent"
+    assert type(solid.step).__name__ == "GaussNewton"
+    assert isinstance(solid.dynamics, ConstantVelocity)
+    assert isinstance(flat.energy, SquaredEnergy)
+    assert flat.refine_steps == 0
+    with pytest.raises(ValueError, match="d must be 2 or 3, found 4"):
+        sandhu2010(4)
+
+
+class _Constant(AbstractEnergy):
+    value: Array | float = traced(0.5)
+
+    def __call__(self, found, width):
+        return jnp.asarray(self.value, width.dtype)
+
+
+@pytest.mark.parametrize("value", [np.inf, np.nan, 0.5])
+def test_energies_that_tell_nothing_leave_uniform_weights(value):
+    pair = _pair(2)
+    method = _small(energy=_Constant(value), resampler=Systematic(0.5))
+    found = _search(method, pair.problem)
+    np.testing.assert_allclose(np.exp(found.particles.log_weight), 1 / P, rtol=1e-5)
+    solution = _conclude(pair, found)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(solution))
+    if not np.isfinite(value):
+        assert int(solution.status) == Status.NON_FINITE
+        np.testing.assert_array_equal(solution.T_target_source, np.eye(3))
+
+
+def test_given_particles_are_in_the_frames_of_the_input():
+    # Far from the origin and in a small unit; one start is the truth.
+    d = 2
+    T = motion(5, d, shift=300.0)
+    target = 100 * blob(N, d) + np.float32(500)
+    source = move(np.linalg.inv(T), target)
+    starts = np.stack([motion(i, d, shift=300.0) for i in range(4)] + [T])
+    method = MultiStart(
+        num_starts=5, num_steps=1, prior=GivenParticles(starts), refine_steps=0
+    )
+    solution = register(source, target, method, key=KEY)
+    angle, shift = pose_error(solution.T_target_source, T)
+    assert angle < 1e-2
+    assert shift < 2
+    with pytest.raises(ValueError, match="dimension 3"):
+        register(np.ones((5, 3)), np.ones((5, 3)), method, key=KEY)
+    pair = _pair(2)
+    with pytest.raises(ValueError, match="one key"):
+        method.solve(pair.source, pair.target, None, jax.random.split(KEY, 2))
+    with pytest.raises(TypeError, match="float"):
+        method.solve(pair.source, pair.target, None, jnp.ones(2))
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "value"),
+    [
+        (ParticleFilter, "num_particles", 0),
+        (ParticleFilter, "num_particles", 1),
+        (ParticleFilter, "num_particles", 4096),
+        (ParticleFilter, "inner_steps", 0),
+        (ParticleFilter, "num_times", 0),
+        (ParticleFilter, "refine_steps", -1),
+        (ParticleFilter, "sample_share", 0.0),
+        (ParticleFilter, "sample_share", 1.5),
+        (ParticleFilter, "width_end", 0.0),
+        (MultiStart, "num_starts", 0),
+        (MultiStart, "num_steps", 0),
+        (MultiStart, "width_start", -1.0),
+    ],
+)
+def test_settings_that_leave_nothing_to_do_are_refused(kind, field, value):
+    with pytest.raises(ValueError, match=f"{kind.__name__}: {field}.*{value}"):
+        kind(**{field: value})
+
+
+def test_as_many_given_particles_as_the_method_starts_with():
+    with pytest.raises(ValueError, match="num_prior = 2048 poses, found 24"):
+        ParticleFilter(prior=GivenParticles(STARTS))
+    with pytest.raises(ValueError, match="num_starts = 512 poses, found 24"):
+        MultiStart(prior=GivenParticles(STARTS))
