@@ -14,16 +14,20 @@ from jaxreg.cloud import PointCloud
 from jaxreg.local import LocalOptimiser, match
 from jaxreg.neighbours import BruteForce
 from jaxreg.particle import (
+    AbsoluteEnergy,
     AbstractDynamics,
     BoundedEnergy,
     ConstantVelocity,
     GaussianPrior,
     GivenParticles,
+    Multinomial,
     MultiStart,
     NoDynamics,
     ParticleFilter,
+    Residual,
     SquaredEnergy,
     StochasticDynamics,
+    Stratified,
     Systematic,
     sandhu2010,
 )
@@ -258,3 +262,30 @@ def test_as_many_given_particles_as_the_method_starts_with():
         ParticleFilter(prior=GivenParticles(STARTS))
     with pytest.raises(ValueError, match="num_starts = 512 poses, found 24"):
         MultiStart(prior=GivenParticles(STARTS))
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        _small(prior=None, resampler=Residual(0.5), energy=AbsoluteEnergy()),
+        _small(dynamics=StochasticDynamics(spread="ensemble"), resampler=Stratified()),
+        _small(dynamics=StochasticDynamics(spread="path"), resampler=Multinomial()),
+        MultiStart(num_starts=P, num_steps=2, refine_steps=0),
+        sandhu2010(2, P, ConstantVelocity()),
+    ],
+    ids=["residual", "ensemble", "path", "multi-start", "paper"],
+)
+def test_parts_go_together_and_keep_the_dtype(method):
+    with jax.enable_x64(True):
+        for dtype in (jnp.float32, jnp.float64):
+            pair = jax.tree.map(
+                lambda x: x.astype(dtype) if x.dtype.kind == "f" else x,  # noqa: B023
+                _pair(2),
+            )
+            out = eqx.filter_eval_shape(method.solve_indexed, *_parts(pair), None, KEY)
+            kinds = {x.dtype for x in jax.tree.leaves(out)}
+            assert kinds == {jnp.dtype(dtype), jnp.dtype(jnp.int32)}
+
+
+def _parts(pair: Pair):
+    return pair.source, pair.target, pair.source_index, pair.target_index
