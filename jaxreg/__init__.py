@@ -54,6 +54,7 @@ from jaxreg.averaging import SpanningTree as SpanningTree
 from jaxreg.averaging import WeightedMotionAveraging as WeightedMotionAveraging
 from jaxreg.averaging import average as average
 from jaxreg.averaging import pose_covariances as pose_covariances
+from jaxreg.correlation import KernelCorrelation as KernelCorrelation
 from jaxreg.graph import PoseGraph as PoseGraph
 from jaxreg.local import ICP as ICP
 from jaxreg.local import ClosedForm as ClosedForm
@@ -70,7 +71,10 @@ from jaxreg.multiview import reconstruct as reconstruct
 from jaxreg.neighbours import BoxTree as BoxTree
 from jaxreg.neighbours import BruteForce as BruteForce
 from jaxreg.neighbours import VoxelTable as VoxelTable
+from jaxreg.neighbours import correspondences as correspondences
+from jaxreg.particle import MultiStart as MultiStart
 from jaxreg.particle import ParticleFilter as ParticleFilter
+from jaxreg.particle import sandhu2010 as sandhu2010
 from jaxreg.registration import register as register
 
 

@@ -8,10 +8,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core.sorting import rows_in_order
 from jaxreg._core.typing import Mask, Points, Scalar
 
 
 UNUSED = jnp.iinfo(jnp.int32).max
+# Share of the cells that are filled in the first attempt to fill at most so many.
+_FULL = 0.95
 
 
 def bits_per_axis(d: int) -> int:
@@ -57,27 +60,48 @@ def cell_size(
     mask: Mask,
     low: Float[Array, " d"],
     side: Scalar,
-    cap: int | Float[Array, ""],
+    num: float | Float[Array, ""],
 ) -> Float[Array, ""]:
-    """A size, nearly the least, at which at most `cap` cells are filled.
+    """A size at which nearly `num` cells are filled.
 
-    Counted at all powers of two from one sort, interpolated between them, and raised
-    while it does not fit.
+    Counted at all powers of two from one sort, and interpolated between them.
     """
     d = points.shape[1]
     bits = bits_per_axis(d)
     finest = side / ((1 << bits) - 1)
     ordered = jnp.sort(cell_keys(points, mask, low, finest))
     counts = jnp.stack([_num_filled(ordered, d * level) for level in range(bits + 1)])
-    level = jnp.argmax(counts <= cap)  # counts fall; the last is 1
+    level = jnp.argmax(counts <= num)  # counts fall; the last is 1
     few = jnp.maximum(counts[level], 1).astype(side.dtype)
     many = jnp.maximum(counts[jnp.maximum(level - 1, 0)], 1).astype(side.dtype)
-    goal = jnp.clip(0.97 * cap, few, many)
-    share = jnp.log(goal / few) / jnp.log(jnp.maximum(many / few, 2.0))
-    start = finest * 2.0 ** (level - share)
+    share = jnp.log(jnp.clip(num, few, many) / few)
+    share = share / jnp.log(jnp.maximum(many / few, 2.0))
+    return finest * 2.0 ** (level - share)
 
-    def too_many(size: Array) -> Array:
-        filled = _num_filled(jnp.sort(cell_keys(points, mask, low, size)))
-        return (filled > cap) & (size < side)
 
-    return lax.while_loop(too_many, lambda size: 1.05 * size, start)
+def cells_in_order(
+    points: Points, mask: Mask, low: Float[Array, " d"], size: Scalar
+) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
+    """Rows that sort the points by the keys of their cells, and those keys."""
+    keys = cell_keys(points, mask, low, size)
+    rows = rows_in_order(keys, 31)
+    return rows, keys[rows]
+
+
+def at_most(
+    cap: int, points: Points, mask: Mask, low: Float[Array, " d"], side: Scalar
+) -> tuple[Float[Array, ""], Int[Array, " n"], Int[Array, " n"]]:
+    """The size at which nearly and at most `cap` cells are filled, and their order."""
+
+    def too_many(state: tuple[Array, Array, Array]) -> Array:
+        size, _, keys = state
+        return (_num_filled(keys) > cap) & (size < side)
+
+    def coarser(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        size = 1.05 * state[0]
+        return size, *cells_in_order(points, mask, low, size)
+
+    # Starts below and not in order, so that the order is computed in one place.
+    size = cell_size(points, mask, low, side, _FULL * cap) / 1.05
+    start = jnp.arange(points.shape[0], dtype=jnp.int32)
+    return lax.while_loop(too_many, coarser, (size, start, start))

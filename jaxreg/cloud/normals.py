@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.sorting import rows_in_order
 from jaxreg._core.typing import Scalar
 from jaxreg.cloud.cells import UNUSED, bits_per_axis, morton_keys
 from jaxreg.geometry.eigen import least_eigenvectors
@@ -26,10 +27,13 @@ _COARSEST = 3
 # A window full of a plane has 0.25.
 _SPAN_SQ = 0.03
 _MIN_POINTS = 5
+# Places that are answered at once.
+_BLOCK = 1024
 
 
 def normals_from_cells(
     places: Float[Array, "p d"],
+    mask: Bool[Array, " p"],
     points: Float[Array, "n d"],
     keys: Int[Array, " n"],
     size: Scalar,
@@ -38,36 +42,45 @@ def normals_from_cells(
 
     Args:
         places: where normals are wanted, relative to the corner of the cells.
+        mask: False for places that are not.
         points: the samples, in the order of their keys, relative to that corner.
         keys: ascending Morton numbers of the points' cells.
         size: side of those cells.
     """
-    d = points.shape[1]
+    d, p = points.shape[1], places.shape[0]
+    width = min(_BLOCK, p)
 
     def unfinished(state: tuple[Array, ...]) -> Array:
-        level, _, found = state
-        return (level <= _COARSEST) & ~jnp.all(found)
+        level, _, done = state
+        return (level <= _COARSEST) & ~jnp.all(done)
 
     def fill(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        level, normals, found = state
-        vectors, spans = _least_spread(places, points, keys, size, level)
-        normals = jnp.where(~found & spans, vectors, normals)
-        return level + 1, normals, found | spans
+        level, normals, done = state
+        cells = _moments_of_cells(points, keys, size, level)
+        # Few places need the coarser levels: those without a normal come first.
+        rows = rows_in_order(done.astype(jnp.int32), 1)
 
-    start = (
-        jnp.asarray(1, jnp.int32),
-        jnp.zeros((d, places.shape[0]), points.dtype),
-        jnp.zeros(places.shape[0], bool),
-    )
+        def block(b: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            normals, done = state
+            at = lax.dynamic_slice_in_dim(rows, b * width, width)
+            vectors, spans = _least_spread(places[at], cells, size, level)
+            vectors = jnp.where(spans & ~done[at], vectors, normals[:, at])
+            return normals.at[:, at].set(vectors), done.at[at].set(done[at] | spans)
+
+        blocks = -(-jnp.sum(~done) // width)
+        normals, done = lax.fori_loop(0, blocks, block, (normals, done))
+        return level + 1, normals, done
+
+    start = (jnp.asarray(1, jnp.int32), jnp.zeros((d, p), points.dtype), ~mask)
     return lax.while_loop(unfinished, fill, start)[1].T
 
 
 def _least_spread(
-    places: Array, points: Array, keys: Array, size: Array, level: Array
+    places: Array, cells: tuple[Array, Array], size: Array, level: Array
 ) -> tuple[Float[Array, "d p"], Bool[Array, " p"]]:
-    d = points.shape[1]
+    d = places.shape[1]
     size = size * (1 << level).astype(size.dtype)
-    cell_key, moments = _moments_of_cells(points, keys, size, level)
+    cell_key, moments = cells
     at = (places / size).T - 0.5
     base = jnp.floor(at)
     offset = at - base
@@ -101,6 +114,7 @@ def _moments_of_cells(
     Lengths are in cells. Rows beyond the last filled cell are `UNUSED` and zero.
     """
     n, d = points.shape
+    size = size * (1 << level).astype(size.dtype)
     key = jnp.where(keys == UNUSED, UNUSED, keys >> (d * level))
     new = jnp.concatenate(
         [jnp.zeros(1, jnp.int32), (key[1:] != key[:-1]).astype(jnp.int32)]

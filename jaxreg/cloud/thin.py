@@ -5,9 +5,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxreg._core.sorting import rows_in_order
 from jaxreg._core.typing import Mask, Points
-from jaxreg.cloud.cells import UNUSED, cell_keys, cell_size
+from jaxreg.cloud.cells import UNUSED, at_most, cell_size, cells_in_order
 from jaxreg.cloud.nearest_normals import normals_from_neighbours
 from jaxreg.cloud.normals import normals_from_cells
 from jaxreg.cloud.point_cloud import PointCloud
@@ -15,7 +14,7 @@ from jaxreg.geometry.boxes import bounding_cube
 
 
 # Points in a cell of the size that normals are estimated with, where none are merged.
-_POINTS_PER_CELL = 2.5
+_POINTS_PER_CELL = 1.6
 
 
 def thin(
@@ -50,8 +49,7 @@ def thin(
         places, valid = total / jnp.maximum(count, 1)[:, None], count > 0
     frozen = lax.stop_gradient(places)
     if num_neighbours is None:
-        normals = normals_from_cells(frozen, samples, keys, size)
-        normals = jnp.where(valid[:, None], normals, 0)
+        normals = normals_from_cells(frozen, valid, samples, keys, size)
     else:
         offset = jnp.where(keys[:, None] != UNUSED, samples - frozen[cell], 0)
         spread = jax.ops.segment_sum(
@@ -68,8 +66,7 @@ def estimate_normals(points: Points, mask: Mask) -> Points:
     """
     low, size, rows, keys = _cells(points, mask, None)
     samples = lax.stop_gradient(jnp.where(mask[rows, None], points[rows] - low, 0))
-    normals = normals_from_cells(samples, samples, keys, size)
-    normals = jnp.where(mask[rows, None], normals, 0)
+    normals = normals_from_cells(samples, mask[rows], samples, keys, size)
     return jnp.zeros_like(normals).at[rows].set(normals)
 
 
@@ -83,16 +80,13 @@ def _cells(
     """
     frozen = lax.stop_gradient(points)
     low, side = bounding_cube(frozen, mask)
-    if capacity is None:
-        num = jnp.sum(mask).astype(points.dtype)
-        few = jnp.maximum(num / _POINTS_PER_CELL, 1)
-        size = cell_size(frozen, mask, low, side, few) / 2
-        size = jnp.maximum(size, side / 1000)
-    else:
-        size = cell_size(frozen, mask, low, side, capacity)
-    keys = cell_keys(frozen, mask, low, size)
-    rows = rows_in_order(keys, 31)
-    return low, size, rows, keys[rows]
+    if capacity is not None:
+        return low, *at_most(capacity, frozen, mask, low, side)
+    num = jnp.sum(mask).astype(points.dtype)
+    few = jnp.maximum(num / _POINTS_PER_CELL, 1)
+    size = cell_size(frozen, mask, low, side, few) / 2
+    size = jnp.maximum(size, side / 1000)
+    return low, size, *cells_in_order(frozen, mask, low, size)
 
 
 def _cell_numbers(keys: Array) -> Array:

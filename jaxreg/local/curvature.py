@@ -7,7 +7,9 @@ from jaxtyping import Array, Float
 
 from jaxreg.local.problem import Match
 from jaxreg.local.residuals import AbstractResidual, PointToPlane, PointToPoint
+from jaxreg.local.residuals.gram import weighted_gram
 from jaxreg.local.steps import condition, gyration_radius
+from jaxreg.local.steps.base import full_matmul
 from jaxreg.local.steps.tiny_solve import solve_semidefinite
 
 
@@ -42,12 +44,10 @@ class Curvature(eqx.Module):
     ) -> "Curvature":
         """At the pose of a match."""
         H, b = residual.normal_equations(found, weight)
-        # b is linear in the weights: its derivative holds the gradients of the points.
-        gradients = jax.jacrev(lambda w: residual.normal_equations(found, w)[1])(weight)
-        spread = gradients * weight
-        meat = jnp.matmul(spread, spread.T, precision=jax.lax.Precision.HIGHEST)
-        half = jax.vmap(solve_semidefinite, (None, 1), 1)(H, meat)
-        covariance = jax.vmap(solve_semidefinite, (None, 1), 1)(H, half.T)
+        meat = weighted_gram(residual.descents(found), weight * weight)
+        eye = jnp.eye(b.shape[0], dtype=b.dtype)
+        bread = jax.vmap(solve_semidefinite, (None, 1), 1)(H, eye)
+        covariance = full_matmul(bread, full_matmul(meat, bread.T))
         return cls(H, b, residual.energy(found, weight), covariance)
 
     def scaled(self, length: Float[Array, ""]) -> "Curvature":

@@ -9,43 +9,28 @@ is `PointToPoint` with `Huber` and `LevenbergMarquardt`.
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.arrays import cast_floats, traced
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
-from jaxreg.cloud import PointCloud, median_spacing, thin
+from jaxreg.cloud import PointCloud, median_spacing, rms_radius, thin
 from jaxreg.geometry import lie
 from jaxreg.local.base import AbstractRegistrar, Modes, RegistrationSolution
 from jaxreg.local.curvature import Curvature, is_degenerate
+from jaxreg.local.descent import Descent, Limits, descend, stride
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.problem import Match, Problem, match
 from jaxreg.local.residuals import AbstractResidual, PlaneToPlane
+from jaxreg.local.scale import fit_scale
 from jaxreg.local.score import score, score_match
-from jaxreg.local.steps import (
-    AbstractStep,
-    GaussNewton,
-    GradientDescent,
-    decoupled_error,
-)
+from jaxreg.local.steps import AbstractStep, GaussNewton, GradientDescent
 from jaxreg.neighbours import AbstractIndex, BruteForce, exact_index
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
 
 # Points of the target that tell its share on the source, to 0.02.
 _SCORED_POINTS = 512
-
-
-class _State(eqx.Module):
-    """Of a descent: `row` and `width` belong to the last match, at `T_matched`."""
-
-    T: Float[Array, "D D"]
-    T_matched: Float[Array, "D D"]
-    row: Int[Array, " n"]
-    first_sq_residual: Float[Array, " n"]
-    width: Float[Array, ""]
-    num_steps: Int[Array, ""]
-    moving: Bool[Array, ""]
 
 
 class ICP(AbstractRegistrar):
@@ -66,6 +51,10 @@ class ICP(AbstractRegistrar):
         width_end: final kernel width in sample spacings.
         tolerance: the loop stops when a step turns by less than this many radians and
             shifts by less than this share of the target's radius, at the final width.
+        with_scale: whether the source may also grow or shrink: then the block of
+            `T_target_source` is a rotation times that factor, without a guess it
+            starts from the ratio of the clouds' radii, and H, b and the covariance
+            are those of the pose at that factor.
 
     Fails: TOO_FEW_POINTS, NON_FINITE, MAX_STEPS; LOW_OVERLAP where nothing agrees;
     DEGENERATE where the matched surfaces leave a direction free (it is left as in the
@@ -77,17 +66,18 @@ class ICP(AbstractRegistrar):
     fixed point up to the curvature of the residual). Nothing flows to `init`.
     """
 
-    # Discs thirty times thicker than GICP's reach the solution from farther away, with
+    # Discs ten times thicker than GICP's reach the solution from farther away, with
     # the same accuracy: their planes hold a sliding match less hard.
-    residual: AbstractResidual = eqx.field(default_factory=lambda: PlaneToPlane(0.03))
+    residual: AbstractResidual = eqx.field(default_factory=lambda: PlaneToPlane(0.01))
     kernel: AbstractKernel = eqx.field(default_factory=GemanMcClure)
     step: AbstractStep = eqx.field(default_factory=GaussNewton)
     index: type[AbstractIndex] | None = eqx.field(default=None, static=True)
     max_steps: int = eqx.field(default=60, static=True)
-    max_points: int = eqx.field(default=4096, static=True)
+    max_points: int = eqx.field(default=8192, static=True)
     max_correspondence_distance: Array | float = traced(float("inf"))
     width_end: Array | float = traced(1.0)
     tolerance: Array | float = traced(1e-4)
+    with_scale: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self) -> None:
         """Refuses counts that leave nothing to do."""
@@ -116,27 +106,43 @@ class ICP(AbstractRegistrar):
         """Descends from `init` in the prepared frames."""
         dtype = source.points.dtype
         self = cast_floats(self, dtype)
-        if init is None:
-            init = lie.identity(source.points.shape[1], dtype)
+        init, scale = self._start(source, target, init)
         spacing = median_spacing(target.points, target.mask)
         problem = Problem.of(source, target, self._indexed(target))
-        frozen, init = lax.stop_gradient((problem, init))
-        state = self._descend(frozen, init, spacing)
+        limits = Limits(
+            max_steps=self.max_steps,
+            with_scale=self.with_scale,
+            farthest=jnp.asarray(self.max_correspondence_distance, dtype),
+            floor=self.width_end * spacing,
+            tolerance=jnp.asarray(self.tolerance, dtype),
+        )
+        frozen, init, scale = lax.stop_gradient((problem, init, scale))
+        end = descend(self._optimiser, frozen, init, scale, limits)
 
-        found = self._within_reach(match(problem, state.T_matched, state.row))
-        weight = lax.stop_gradient(self._optimiser.weights(found, state.width))
-        T = self._last_step(state.T_matched, found, weight)
-        worse = self._worse_than(state, frozen, lax.stop_gradient(found))
+        scale = end.scale_matched
+        found = match(problem.scaled(scale), end.T_matched, end.row)
+        found = limits.within_reach(found)
+        weight = lax.stop_gradient(self._optimiser.weights(found, end.width))
+        if self.with_scale:
+            growth, found = fit_scale(self.residual, found, weight)
+            scale = scale * growth
+        T = self._last_step(end.T_matched, found, weight)
+        worse = self._worse_than(end, frozen, lax.stop_gradient(found), limits)
         T = jnp.where(worse, init, T)
 
-        spacing = jnp.maximum(spacing, median_spacing(source.points, source.mask))
+        spacing = jnp.maximum(
+            spacing, scale * median_spacing(source.points, source.mask)
+        )
         there = score_match(found, spacing)
-        back = self._score_of_target(source, target, lax.stop_gradient(T), spacing)
-        status = jnp.where(state.moving, Status.MAX_STEPS, Status.CONVERGED)
+        back = self._score_of_target(
+            source, target, lax.stop_gradient(T), scale, spacing
+        )
+        status = jnp.where(end.moving, Status.MAX_STEPS, Status.CONVERGED)
         degenerate = is_degenerate(self.residual, found, weight)
         status = jnp.where(degenerate, Status.DEGENERATE, status)
         status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
         status = jnp.where(worse, Status.DIVERGED, status)
+        T = lie.compose(scale * lie.rotation(T), lie.translation(T))
         status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
         curvature = Curvature.of(self.residual, found, weight)
         return RegistrationSolution(
@@ -146,7 +152,7 @@ class ICP(AbstractRegistrar):
             inlier_rmse=there.inlier_rmse,
             num_inliers=there.num_inliers,
             overlap=jnp.minimum(there.fitness, back),
-            num_steps=state.num_steps,
+            num_steps=end.num_steps,
             H=curvature.H,
             b=curvature.b,
             error=curvature.error,
@@ -162,52 +168,24 @@ class ICP(AbstractRegistrar):
         index = self.index or exact_index(cloud.points.shape[0])
         return index.build(cloud.points, cloud.mask)
 
-    def _within_reach(self, found: Match) -> Match:
-        near = found.sq_residual <= jnp.asarray(self.max_correspondence_distance) ** 2
-        return eqx.tree_at(
-            lambda m: (m.mask, m.agreement),
-            found,
-            (found.mask & near, jnp.where(near, found.agreement, 0)),
-        )
-
-    def _descend(
-        self, problem: Problem, init: Motion, spacing: Float[Array, ""]
-    ) -> _State:
-        """The end of the descent."""
-        floor = self.width_end * spacing
-
-        def body(state: _State) -> _State:
-            found = self._within_reach(match(problem, state.T))
-            width = self.kernel.width_of(found.sq_residual, found.mask)
-            width = jnp.maximum(jnp.minimum(width, state.width), floor)
-            T = lie.orthonormalise(self._optimiser.update(state.T, found, width))
-            change = jnp.max(jnp.abs(decoupled_error(T, state.T)))
-            first = state.num_steps == 0
-            return _State(
-                T=T,
-                T_matched=state.T,
-                row=found.row,
-                first_sq_residual=jnp.where(
-                    first, found.sq_residual, state.first_sq_residual
-                ),
-                width=width,
-                num_steps=state.num_steps + 1,
-                moving=(change > self.tolerance) | (width < 0.99 * state.width),
-            )
-
-        n = problem.source.shape[1]
-        start = _State(
-            T=init,
-            T_matched=init,
-            row=jnp.zeros(n, jnp.int32),
-            first_sq_residual=jnp.zeros(n, init.dtype),
-            width=jnp.asarray(jnp.inf, init.dtype),
-            num_steps=jnp.zeros((), jnp.int32),
-            moving=jnp.asarray(True),
-        )
-        return lax.while_loop(
-            lambda s: s.moving & (s.num_steps < self.max_steps), body, start
-        )
+    def _start(
+        self, source: PointCloud, target: PointCloud, init: Motion | None
+    ) -> tuple[Motion, Float[Array, ""]]:
+        """The rigid guess and the scale before it."""
+        d, dtype = source.points.shape[1], source.points.dtype
+        one = jnp.ones((), dtype)
+        if init is None:
+            if self.with_scale:
+                radius = rms_radius(source.points, source.mask)
+                ratio = rms_radius(target.points, target.mask) / radius
+                one = jnp.where(radius > 0, ratio, one)
+            return lie.identity(d, dtype), one
+        if not self.with_scale:
+            return init, one
+        block = lie.rotation(init)
+        scale = jnp.sqrt(jnp.sum(block * block) / d)
+        scale = jnp.where(scale > 0, scale, one)
+        return lie.compose(block / scale, lie.translation(init)), scale
 
     def _last_step(
         self, T: Motion, found: Match, weight: Float[Array, " n"]
@@ -220,23 +198,31 @@ class ICP(AbstractRegistrar):
         return step(T, found, weight, self.residual)
 
     def _worse_than(
-        self, state: _State, problem: Problem, found: Match
+        self, end: Descent, problem: Problem, found: Match, limits: Limits
     ) -> Bool[Array, ""]:
         """Whether the guess fits better than the match at the end."""
-        farthest = jnp.asarray(self.max_correspondence_distance) ** 2
+        every = stride(found.mask.shape[0])
+        mask = problem.every(every).source_mask
 
         def loss(sq_residual: Array) -> Array:
-            sq = jnp.minimum(sq_residual, farthest)
-            rho = self.kernel.rho(sq, state.width)
-            return jnp.sum(jnp.where(problem.source_mask, rho, 0))
+            sq = jnp.minimum(sq_residual, limits.farthest**2)
+            return jnp.sum(jnp.where(mask, self.kernel.rho(sq, end.width), 0))
 
-        return loss(state.first_sq_residual) < 0.999 * loss(found.sq_residual)
+        last = found.sq_residual[::every]
+        return loss(end.first_sq_residual[: len(last)]) < 0.999 * loss(last)
 
     def _score_of_target(
-        self, source: PointCloud, target: PointCloud, T: Motion, spacing: Scalar
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        T: Motion,
+        scale: Scalar,
+        spacing: Scalar,
     ) -> Float[Array, ""]:
         """The share of the target that lies on the source."""
         # Few queries, far apart: comparing all pairs is quicker than building a tree.
+        points = lax.stop_gradient(scale) * source.points
+        source = PointCloud(points, source.normals, source.mask)
         index = BruteForce.build(source.points, source.mask)
         problem = Problem.of(target, source, index)
         some = problem.every(max(target.points.shape[0] // _SCORED_POINTS, 1))

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.typing import Motion
+from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import PointCloud
 from jaxreg.geometry import lie
 from jaxreg.neighbours.base import AbstractIndex
@@ -58,6 +58,21 @@ class Problem(eqx.Module):
     def every(self, step: int) -> "Problem":
         """The problem of every `step`-th source point."""
         return self.of_rows(slice(None, None, step))
+
+    def scaled(self, scale: Scalar) -> "Problem":
+        """The problem with the source a factor larger."""
+        return eqx.tree_at(lambda p: p.source, self, scale * self.source)
+
+    def padded(self, num: int) -> "Problem":
+        """The problem with masked rows behind the source, `num` in all."""
+        pad = num - self.source_mask.shape[0]
+        return Problem(
+            jnp.pad(self.source, ((0, 0), (0, pad))),
+            jnp.pad(self.source_normals, ((0, 0), (0, pad))),
+            jnp.pad(self.source_mask, (0, pad)),
+            self.target,
+            self.index,
+        )
 
 
 class Match(eqx.Module):
@@ -110,17 +125,21 @@ def rotate(R: Float[Array, "d d"], columns: Float[Array, "d n"]) -> Float[Array,
 
 
 def match(
-    problem: Problem, T_target_source: Motion, row: Int[Array, " n"] | None = None
+    problem: Problem,
+    T_target_source: Motion,
+    row: Int[Array, " n"] | None = None,
+    num: Int[Array, ""] | None = None,
 ) -> Match:
     """Closest target points of the source under a pose (PF paper, Eq. 2).
 
-    Where `row` is given, those rows of the target are taken instead of the closest.
+    Where `row` is given, those rows of the target are taken instead of the closest;
+    with `num`, matches of source points beyond the first `num` are arbitrary.
     """
     d = problem.source.shape[0]
     R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
     rotated = rotate(R, problem.source)
     moved = rotated + t[:, None]
-    row = problem.index.lookup(moved) if row is None else row
+    row = problem.index.lookup(moved, num) if row is None else row
     found = problem.target[row]
     normal = jnp.stack([found[:, d + k] for k in range(d)])
     residual = jnp.stack([found[:, k] for k in range(d)]) - moved

@@ -13,9 +13,12 @@ table five times faster from that layout.
 """
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Mask, Points, Scalar
@@ -49,10 +52,13 @@ class AbstractIndex(eqx.Module):
         """Prepares the search among `(m, d)` points of which `mask` are valid."""
 
     @abc.abstractmethod
-    def lookup(self, columns: Float[Array, "d n"]) -> Int[Array, " n"]:
+    def lookup(
+        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
+    ) -> Int[Array, " n"]:
         """The row of the closest valid target of each query, given as `(d, n)`.
 
-        Any row where no target is valid or the query is not finite.
+        Any row where no target is valid or the query is not finite, and for queries
+        beyond the first `num`, which save their time.
         """
 
     def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
@@ -90,3 +96,24 @@ class AbstractIndex(eqx.Module):
         if radius is not None:
             valid = valid & (sq <= jnp.asarray(radius, sq.dtype) ** 2)
         return Neighbours(index, jnp.where(found, sq, jnp.inf) if k > 1 else sq, valid)
+
+
+def map_first(
+    find: Callable[[Array], Array],
+    tiles: Float[Array, "a d t"],
+    num: Int[Array, ""] | None,
+) -> Int[Array, "a *k t"]:
+    """`find` of each tile; only of those that hold the first `num` columns, if given.
+
+    The others are zero.
+    """
+    if num is None:
+        return lax.map(find, tiles)
+    out = jax.eval_shape(find, jax.ShapeDtypeStruct(tiles.shape[1:], tiles.dtype))
+
+    def one(at: Array, found: Array) -> Array:
+        return found.at[at].set(find(tiles[at]))
+
+    first = -(-num // tiles.shape[2])
+    start = jnp.zeros((tiles.shape[0], *out.shape), out.dtype)
+    return lax.fori_loop(0, first, one, start)

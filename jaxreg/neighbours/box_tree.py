@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Mask, Points, Scalar
-from jaxreg.neighbours.base import AbstractIndex, Neighbours
+from jaxreg.neighbours.base import AbstractIndex, Neighbours, map_first
 from jaxreg.neighbours.brute import BruteForce
 from jaxreg.neighbours.order import hilbert_order
 
@@ -74,7 +74,9 @@ class BoxTree(AbstractIndex):
             jnp.max(high, axis=1).T,
         )
 
-    def lookup(self, columns: Float[Array, "d n"]) -> Int[Array, " n"]:
+    def lookup(
+        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
+    ) -> Int[Array, " n"]:
         """A closest valid target of each query."""
         d, n = columns.shape
         columns = lax.stop_gradient(columns)
@@ -84,7 +86,7 @@ class BoxTree(AbstractIndex):
         tile = min(_TILE, n)
         padded = jnp.pad(columns, ((0, 0), (0, -n % tile)), mode="edge")
         tiles = jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
-        leaf = lax.map(self._leaf_of_tile, tiles).reshape(-1)[:n]
+        leaf = map_first(self._leaf_of_tile, tiles, num).reshape(-1)[:n]
         return self._row_in_leaf(columns, leaf)
 
     def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:

@@ -14,12 +14,14 @@ two more instructions than `where`. And a value with two users is computed for e
 them, unless a loop returns it: hence the loop over groups whose only result is stored.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Mask, Points
-from jaxreg.neighbours.base import AbstractIndex
+from jaxreg.neighbours.base import AbstractIndex, map_first
 
 
 _GROUP = 16
@@ -47,7 +49,9 @@ class BruteForce(AbstractIndex):
         finite = jnp.all(jnp.isfinite(points), axis=1)
         return cls(points, finite if mask is None else mask & finite)
 
-    def lookup(self, columns: Float[Array, "d n"]) -> Int[Array, " n"]:
+    def lookup(
+        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
+    ) -> Int[Array, " n"]:
         """The closest valid target of each query, exactly."""
         groups, scale = self._groups()
         # Less padding than rounding the number of groups up to a whole tile.
@@ -60,7 +64,7 @@ class BruteForce(AbstractIndex):
             group = _closest_group(queries, groups.reshape(tiles, length, -1, _GROUP))
             return _closest_in_group(queries, groups, group)
 
-        row = _by_tiles(closest, scale * lax.stop_gradient(columns), _QUERIES)
+        row = _by_tiles(closest, scale * lax.stop_gradient(columns), _QUERIES, num)
         first = jnp.argmax(self.mask).astype(jnp.int32)  # where all are too far
         return jnp.where(row < 0, first, row)
 
@@ -90,13 +94,15 @@ class BruteForce(AbstractIndex):
         return jnp.swapaxes(scaled.reshape(-1, _GROUP, d), 1, 2), scale
 
 
-def _by_tiles(find, columns: Array, size: int) -> Array:
+def _by_tiles(
+    find: Callable[[Array], Array], columns: Array, size: int, num: Array | None = None
+) -> Array:
     """`find` of tiles `(d, t)` of the queries, side by side along the last axis."""
     d, n = columns.shape
     tiles = max(-(-n // size), 1)
     size = -(-n // tiles)
     padded = jnp.pad(columns, ((0, 0), (0, tiles * size - n)))
-    found = lax.map(find, jnp.swapaxes(padded.reshape(d, tiles, size), 0, 1))
+    found = map_first(find, jnp.swapaxes(padded.reshape(d, tiles, size), 0, 1), num)
     found = jnp.moveaxis(found, 0, -2)
     return found.reshape(*found.shape[:-2], -1)[..., :n]
 

@@ -101,8 +101,10 @@ class VoxelTable(AbstractIndex):
             points, mask, table, coordinates, origin, cell, resolution, candidates
         )
 
-    def lookup(self, columns: Float[Array, "d n"]) -> Int[Array, " n"]:
-        """The nearest of the candidates of each query's cell."""
+    def lookup(
+        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
+    ) -> Int[Array, " n"]:
+        """The nearest of the candidates of each query's cell; `num` saves nothing."""
         home = _cell_of(columns, self.origin, self.cell, self.resolution)
         if self.coordinates is None:
             return self.table[home]

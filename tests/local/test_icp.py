@@ -77,11 +77,34 @@ def test_a_plane_on_a_plane_is_degenerate():
 
 def test_an_end_worse_than_the_guess_is_reported_and_the_guess_returned(near):
     source, target, T, _, _ = near
-    guess = motion(26, 3, angle=1.2, shift=1.5) @ T
+    guess = motion(37, 3, angle=1.2, shift=1.5) @ T
     method = jr.ICP(jr.Symmetric(), L2(), max_steps=3)
     sol = jr.register(source, target, method, init=guess)
     assert int(sol.status) == Status.DIVERGED
     np.testing.assert_allclose(sol.T_target_source, guess, atol=1e-4)
+
+
+@pytest.mark.parametrize("factor", [0.5, 20.0])
+def test_scale_is_found_with_the_pose_if_asked(near, factor):
+    source, target, T, _, _ = near
+    method = jr.ICP(with_scale=True)
+    sol = jr.register(np.float32(factor) * source, target, method)
+    assert int(sol.status) == Status.CONVERGED
+    block = np.asarray(sol.T_target_source, np.float64)[:3, :3] * factor
+    np.testing.assert_allclose(block @ block.T, np.eye(3), atol=0.02)
+    moved = move(sol.T_target_source, np.float32(factor) * source)
+    assert np.abs(moved - move(T, source)).max() < 0.05
+    # The guess's scale is taken from its block.
+    start = np.diag(np.float32([1 / factor] * 3 + [1])) @ np.eye(4, dtype=np.float32)
+    again = jr.register(np.float32(factor) * source, target, method, init=start)
+    np.testing.assert_allclose(again.T_target_source, sol.T_target_source, atol=0.02)
+
+
+def test_without_asking_the_answer_is_rigid(near):
+    source, target, _, init, _ = near
+    sol = jr.register(np.float32(1.1) * source, target, jr.ICP(), init=init)
+    block = np.asarray(sol.T_target_source)[:3, :3]
+    np.testing.assert_allclose(block @ block.T, np.eye(3), atol=1e-5)
 
 
 def _line(num: int) -> np.ndarray:

@@ -86,6 +86,7 @@ def test_normal_equations_are_those_of_the_linearised_residual(d, residual):
             return (
                 (H, jnp.einsum("n,nri,nrj->ij", weight, J, J)),
                 (b, jnp.einsum("n,nri,nr->i", weight, J, r)),
+                (residual.descents(found) @ weight, b),
                 (b, -slope),
                 (
                     residual.energy(found, weight),

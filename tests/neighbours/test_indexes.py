@@ -85,6 +85,16 @@ def test_targets_that_are_not_finite_are_never_found(index):
 
 
 @pytest.mark.parametrize("index", INDEXES)
+def test_the_first_queries_do_not_depend_on_how_many_are_answered(index):
+    target, mask, queries = clouds("random", 0, 3)
+    built = index.build(jnp.asarray(target), jnp.asarray(mask))
+    columns = jnp.tile(jnp.asarray(queries), (40, 1)).T
+    find = jax.jit(lambda queries, num: built.lookup(queries, num))
+    some = find(columns, jnp.asarray(300))
+    np.testing.assert_array_equal(some[:300], built.lookup(columns)[:300])
+
+
+@pytest.mark.parametrize("index", INDEXES)
 def test_vmap_equals_the_loop(index):
     sets = [clouds("random", seed, 3) for seed in range(3)]
     find = _compiled(index)
@@ -127,7 +137,7 @@ class _First(AbstractIndex):
     def build(cls, points, mask=None):
         return cls(points, jnp.ones(len(points), bool) if mask is None else mask)
 
-    def lookup(self, columns):
+    def lookup(self, columns, num=None):
         return jnp.zeros(columns.shape[1], jnp.int32)
 
 

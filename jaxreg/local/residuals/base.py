@@ -33,6 +33,10 @@ class AbstractResidual(eqx.Module):
         """H and b for the tangent (v, w), translation first."""
 
     @abc.abstractmethod
+    def descents(self, match: Match) -> Float[Array, "k n"]:
+        """What each point adds to b at weight one: J^T r."""
+
+    @abc.abstractmethod
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """The weighted sum of half squared residuals, of which b is the descent.
 

@@ -46,6 +46,14 @@ class PlaneToPlane(AbstractResidual):
             H, b = H + gram[:-1, :-1], b + gram[:-1, -1]
         return H, b
 
+    def descents(self, match: Match) -> Float[Array, "k n"]:
+        """Half of point-to-point plus what pulls along s and a."""
+        out = PointToPoint().descents(match) / 2
+        for direction, stiffness in self._axes(match):
+            rows = along(direction, match)
+            out = out + stiffness * rows[:-1] * rows[-1]
+        return out
+
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w r^T M r / 2."""
         sq = match.sq_residual / 2

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxreg.local.problem import Match
 from jaxreg.local.residuals.base import AbstractResidual
-from jaxreg.local.residuals.gram import Moments, half_sum
+from jaxreg.local.residuals.gram import Moments, cross, half_sum
 
 
 class PointToPoint(AbstractResidual):
@@ -42,6 +42,10 @@ class PointToPoint(AbstractResidual):
             )
         H = jnp.block([[moments.total * eye, G], [G.T, GG]])
         return H, jnp.concatenate([moments.r, Gr])
+
+    def descents(self, match: Match) -> Float[Array, "k n"]:
+        """Rows (r, x cross r)."""
+        return jnp.stack([*match.residual, *cross(match.rotated, match.residual)])
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w |r|^2 / 2."""

@@ -34,17 +34,24 @@ class Symmetric(AbstractResidual):
         self, match: Match, weight: Float[Array, " n"]
     ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
         """The Gram matrix of rows (n, x cross n + r cross n_p, n . r)."""
-        p, n, r = _source_normal(match), _normal_sum(match), match.residual
-        turn = [
-            a + b for a, b in zip(cross(match.rotated, n), cross(r, p), strict=True)
-        ]
-        gram = weighted_gram(jnp.stack([*n, *turn, sum_rows(n * r)]), weight)
+        gram = weighted_gram(_rows(match), weight)
         return gram[:-1, :-1], gram[:-1, -1]
+
+    def descents(self, match: Match) -> Float[Array, "k n"]:
+        """Rows (n, x cross n + r cross n_p) times n . r."""
+        rows = _rows(match)
+        return rows[:-1] * rows[-1]
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w ((n_p + n_q) . r)^2 / 2."""
         height = sum_rows(_normal_sum(match) * match.residual)
         return half_sum(height * height, weight)
+
+
+def _rows(match: Match) -> Float[Array, "k1 n"]:
+    p, n, r = _source_normal(match), _normal_sum(match), match.residual
+    turn = [a + b for a, b in zip(cross(match.rotated, n), cross(r, p), strict=True)]
+    return jnp.stack([*n, *turn, sum_rows(n * r)])
 
 
 def _source_normal(match: Match) -> Float[Array, "d n"]:

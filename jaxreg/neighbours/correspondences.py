@@ -1,0 +1,78 @@
+"""Which target point each source point falls on at a pose."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxreg._core.checks import as_float_array, check_mask, check_motion, check_points
+from jaxreg.geometry import lie
+from jaxreg.neighbours.auto import exact_index
+from jaxreg.neighbours.base import Neighbours
+
+
+def correspondences(
+    source: object,
+    target: object,
+    T_target_source: object,
+    *,
+    max_distance: float | Array | None = None,
+    source_mask: object = None,
+    target_mask: object = None,
+) -> Neighbours:
+    """The closest target point of every source point under a pose, exactly.
+
+    For the pose of any method, on all the points of one pair (`register` itself works
+    on thinned clouds). Batches by `jax.vmap`.
+
+    Args:
+        source: `(n, d)` points.
+        target: `(m, d)` points of the same dtype.
+        T_target_source: `(d+1, d+1)`, such as `sol.T_target_source`.
+        max_distance: pairs farther apart are flagged invalid, in the unit of the
+            points.
+        source_mask: `(n,)` True for valid points; others are flagged invalid.
+        target_mask: `(m,)` True for valid points; others are never found.
+
+    Returns:
+        `Neighbours` with `index` `(n,)` rows of the target, `sq_distance` `(n,)` and
+        `valid` `(n,)`.
+
+    Raises:
+        ValueError, TypeError: while tracing, for shapes and dtypes that do not fit.
+
+    Gradients: of `sq_distance`, with respect to both clouds and the pose.
+    """
+    source = as_float_array(source, "source")
+    target = as_float_array(target, "target")
+    d = check_points(source, "source")
+    if source.ndim != 2 or target.ndim != 2 or check_points(target, "target") != d:
+        raise ValueError(
+            "target: wanted one pair of point sets (n, d) and (m, d), found shapes "
+            f"{source.shape} and {target.shape}."
+        )
+    if target.dtype != source.dtype:
+        raise TypeError(
+            f"target: wanted dtype {source.dtype} like source, found {target.dtype}."
+        )
+    T = as_float_array(T_target_source, "T_target_source").astype(source.dtype)
+    if T.ndim != 2:
+        raise ValueError(f"T_target_source: wanted one motion, found shape {T.shape}.")
+    check_motion(T, d, "T_target_source")
+    source_mask = check_mask(source_mask, source.shape[:-1], "source_mask")
+    target_mask = check_mask(target_mask, target.shape[:-1], "target_mask")
+    return _find(source, target, T, max_distance, source_mask, target_mask)
+
+
+@eqx.filter_jit
+def _find(
+    source: Array,
+    target: Array,
+    T: Array,
+    max_distance: float | Array | None,
+    source_mask: Array,
+    target_mask: Array,
+) -> Neighbours:
+    index = exact_index(target.shape[0]).build(target, target_mask)
+    radius = None if max_distance is None else jnp.asarray(max_distance, source.dtype)
+    found = index.query(lie.act(T, source), radius=radius)
+    return eqx.tree_at(lambda f: f.valid, found, found.valid & source_mask)
