@@ -85,7 +85,7 @@ def _seen(T: np.ndarray, turn: np.ndarray, centre: np.ndarray) -> np.ndarray:
 def _window(axis: Any, clean: np.ndarray) -> None:
     """The same window in all panels: the reference and a margin."""
     low, high = clean.min(axis=0), clean.max(axis=0)
-    middle, half = (low + high) / 2, 0.62 * float(np.max(high - low))
+    middle, half = (low + high) / 2, 0.56 * float(np.max(high - low))
     axis.set_xlim(middle[0] - half, middle[0] + half)
     axis.set_ylim(middle[1] - half, middle[1] + half)
     axis.set_aspect("equal", adjustable="box")

@@ -36,6 +36,7 @@ class Motions(NamedTuple):
     trusted: np.ndarray  # (e,) overlap that `reconstruct` averages
     T_refined: np.ndarray  # (v, 4, 4) what `reconstruct` returns in the end
     T_true: np.ndarray  # (v, 4, 4) world from scan
+    centre: np.ndarray  # (v, 3) mean of each scan
     seconds: float  # of `reconstruct`, compilation included
 
 
@@ -56,11 +57,13 @@ def estimate(name: str, data: Path, seed: int, cache: Path | None) -> Motions:
     """Registers all pairs of a set, or reads what an earlier call left in `cache`."""
     title, scans, T_true = load_scans(name, data)
     kind = "scans" if title.startswith("Stanford") else "sculpture"
+    centre = MM * np.stack([np.mean(x, axis=0, dtype=np.float64) for x in scans])
     path = None if cache is None else cache / f"motions_{name}_{kind}_{seed}.npz"
     if path is not None and path.exists():
         with np.load(path) as file:
             parts = {k: file[k] for k in file.files if k != "seconds"}
-            return Motions(f"{title}, seed {seed}", **parts, seconds=file["seconds"])
+            seconds = float(file["seconds"])
+        return Motions(f"{title}, seed {seed}", **parts, centre=centre, seconds=seconds)
     begin = time.perf_counter()
     found = reconstruct(scans, key=jax.random.key(seed))
     found = jax.block_until_ready(found)
@@ -77,7 +80,7 @@ def estimate(name: str, data: Path, seed: int, cache: Path | None) -> Motions:
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(path, **parts, seconds=seconds)
-    return Motions(f"{title}, seed {seed}", **parts, seconds=seconds)
+    return Motions(f"{title}, seed {seed}", **parts, centre=centre, seconds=seconds)
 
 
 def _in_mm(T: np.ndarray) -> np.ndarray:
