@@ -1,10 +1,13 @@
 """`register`: the pose of one point set in the frame of another."""
 
-from typing import Any
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -14,6 +17,7 @@ from jaxreg._core.checks import (
     check_mask,
     check_motion,
     check_points,
+    is_concrete,
 )
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
@@ -21,6 +25,10 @@ from jaxreg.cloud import centroid, rms_radius
 from jaxreg.geometry import lie
 from jaxreg.local import AbstractRegistrar, Curvature, Modes, RegistrationSolution
 from jaxreg.particle import AbstractSearch, ParticleFilter
+
+
+# Sources, targets, masks of both, and initial poses.
+_Pairs = tuple[Array, Array, Array, Array, Array | None]
 
 
 def register(
@@ -94,43 +102,61 @@ def register(
         init = jnp.broadcast_to(init, (*batch, d + 1, d + 1))
     if key is not None:
         key = check_key(key)
-    return _register(method, source, target, source_mask, target_mask, init, key)
+    pairs = (source, target, source_mask, target_mask, init)
+    if not batch:
+        return _register_one(method, pairs, key)
+    num = math.prod(batch)
+    flat = jax.tree.map(lambda x: x.reshape(num, *x.shape[len(batch) :]), pairs)
+    keys = None if key is None else jax.random.split(key, num)
+    every = (method, flat, keys)
+    threads = all(map(is_concrete, jax.tree.leaves(every)))
+    threads = threads and jax.default_backend() == "cpu"
+    solution = _in_threads(*every) if threads else _register_rows(*every, num, 0)
+    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solution)
 
 
 @eqx.filter_jit
-def _register(
-    method: AbstractRegistrar,
-    source: Array,
-    target: Array,
-    source_mask: Array,
-    target_mask: Array,
-    init: Array | None,
-    key: Array | None,
+def _register_one(
+    method: AbstractRegistrar, pair: _Pairs, key: Array | None
 ) -> RegistrationSolution:
-    batch = source.shape[:-2]
-    if not batch:
-        return _register_pair(
-            method, source, target, source_mask, target_mask, init, key
-        )
-    num = 1
-    for size in batch:
-        num *= size
-    keys = None if key is None else jax.random.split(key, num)
+    return _register_pair(method, *pair, key)
 
-    def flat(x: Array) -> Array:
-        return x.reshape(num, *x.shape[len(batch) :])
 
-    arrays = jax.tree.map(flat, (source, target, source_mask, target_mask, init))
+@eqx.filter_jit
+def _register_rows(
+    method: AbstractRegistrar,
+    pairs: _Pairs,
+    keys: Array | None,
+    num: int,
+    start: Array | int,
+) -> RegistrationSolution:
+    """Of `num` pairs from `start` on, one after another: memory stays bounded."""
 
-    # One pair after another: a pair fills the machine, and memory stays bounded.
-    def one(args: tuple[Any, Array | None]) -> RegistrationSolution:
-        (source, target, source_mask, target_mask, init), key = args
-        return _register_pair(
-            method, source, target, source_mask, target_mask, init, key
-        )
+    def one(args: tuple[_Pairs, Array | None]) -> RegistrationSolution:
+        return _register_pair(method, *args[0], args[1])
 
-    solution = lax.map(one, (arrays, keys))
-    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solution)
+    rows = start + jnp.arange(num)
+    return lax.map(one, jax.tree.map(lambda x: x[rows], (pairs, keys)))
+
+
+def _in_threads(
+    method: AbstractRegistrar, pairs: _Pairs, keys: Array | None
+) -> RegistrationSolution:
+    """Chunks of a batch on all cores of a CPU: XLA runs a loop on one."""
+    num = pairs[0].shape[0]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    chunk = num if cores == 1 else max(num // (4 * cores), 1)
+
+    def run(start: int) -> RegistrationSolution:
+        first = min(start, num - chunk)
+        found = _register_rows(method, pairs, keys, chunk, jnp.asarray(first))
+        return jax.tree.map(lambda x: np.asarray(x)[start - first :], found)
+
+    starts = range(0, num, chunk)
+    parts = [run(0)]  # compiles; the threads then share the program
+    with ThreadPoolExecutor(cores) as pool:
+        parts += pool.map(run, starts[1:])
+    return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts)
 
 
 def _register_pair(

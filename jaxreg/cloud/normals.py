@@ -21,7 +21,7 @@ from jaxreg.cloud.cells import UNUSED, bits_per_axis, morton_keys
 from jaxreg.geometry.eigen import least_eigenvectors
 
 
-# Windows are made of cells of 2, 4, at last 8 times the size that keys were made with.
+# Windows are made of cells of at last 8 times the size that keys were made with.
 _COARSEST = 3
 # The second least spread of a window, in cells, below which it does not span a plane.
 # A window full of a plane has 0.25.
@@ -37,6 +37,7 @@ def normals_from_cells(
     points: Float[Array, "n d"],
     keys: Int[Array, " n"],
     size: Scalar,
+    finest: int,
 ) -> Float[Array, "p d"]:
     """Unit normals of either sign at `places`; zero where undefined.
 
@@ -46,6 +47,8 @@ def normals_from_cells(
         points: the samples, in the order of their keys, relative to that corner.
         keys: ascending Morton numbers of the points' cells.
         size: side of those cells.
+        finest: windows are made of cells of 2^finest times that size first, then of
+            twice as large ones.
     """
     d, p = points.shape[1], places.shape[0]
     width = min(_BLOCK, p)
@@ -71,7 +74,7 @@ def normals_from_cells(
         normals, done = lax.fori_loop(0, blocks, block, (normals, done))
         return level + 1, normals, done
 
-    start = (jnp.asarray(1, jnp.int32), jnp.zeros((d, p), points.dtype), ~mask)
+    start = (jnp.asarray(finest, jnp.int32), jnp.zeros((d, p), points.dtype), ~mask)
     return lax.while_loop(unfinished, fill, start)[1].T
 
 

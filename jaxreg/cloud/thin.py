@@ -15,6 +15,8 @@ from jaxreg.geometry.boxes import bounding_cube
 
 # Points in a cell of the size that normals are estimated with, where none are merged.
 _POINTS_PER_CELL = 1.6
+# Points in a merged cell from which on its own moments tell the normal.
+_MANY = 4
 
 
 def thin(
@@ -49,7 +51,9 @@ def thin(
         places, valid = total / jnp.maximum(count, 1)[:, None], count > 0
     frozen = lax.stop_gradient(places)
     if num_neighbours is None:
-        normals = normals_from_cells(frozen, valid, samples, keys, size)
+        # Cells that merge many points are windows already.
+        finest = 0 if n >= _MANY * capacity else 1
+        normals = normals_from_cells(frozen, valid, samples, keys, size, finest)
     else:
         offset = jnp.where(keys[:, None] != UNUSED, samples - frozen[cell], 0)
         spread = jax.ops.segment_sum(
@@ -66,7 +70,7 @@ def estimate_normals(points: Points, mask: Mask) -> Points:
     """
     low, size, rows, keys = _cells(points, mask, None)
     samples = lax.stop_gradient(jnp.where(mask[rows, None], points[rows] - low, 0))
-    normals = normals_from_cells(samples, mask[rows], samples, keys, size)
+    normals = normals_from_cells(samples, mask[rows], samples, keys, size, 1)
     return jnp.zeros_like(normals).at[rows].set(normals)
 
 
