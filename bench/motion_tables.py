@@ -25,8 +25,8 @@ poses that are wrong and agree with as many edges as the true ones cannot be tol
 them by motions alone. G2O takes the identity as information, lengths in millimetres, as
 in the paper. --centred averages in frames at the means of the scans, as `reconstruct`
 does; errors remain those of the frames given. Times are medians of calls after the
-first, without the start; first calls (with compilation, where the set of edges is the
-first of its scans) are apart.
+first, without the start; first calls are apart: they compile for the first set of edges
+of each object, unless a compilation cache is in use.
 """
 
 import argparse

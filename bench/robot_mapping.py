@@ -181,7 +181,7 @@ def show(row: dict, share: float, seed: int, odometry: float) -> None:
     """Prints a row; 'no gain' where it is no nearer than the odometry."""
     print(
         f"{share:6.0%}{seed:5d} {row['method']:10}{row['objective ratio']:11.4g}"
-        f"{row['e_t mean']:10.4f}{row['e_t max']:10.4f}{row['e_R mean']:9.4f}",
+        f"{row['e_t mean']:10.4g}{row['e_t max']:10.4g}{row['e_R mean']:9.4f}",
         end="",
     )
     if "status" in row:
