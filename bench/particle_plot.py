@@ -1,0 +1,61 @@
+"""The picture of an experiment: one trial before and after each of a few methods."""
+
+import io
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.particle_data import moved
+from jaxreg.io.atomic import atomic_write
+from jaxreg.plot.figure import figure_module, tilt
+
+
+_TARGET, _SOURCE = "#b4bac2", "#c1272d"
+
+
+class Panel(NamedTuple):
+    """Where a method puts the source; `T_target_source` is `(d+1, d+1)`."""
+
+    title: str
+    T_target_source: np.ndarray
+
+
+def trial_figure(
+    path: Path, source: np.ndarray, target: np.ndarray, panels: list[Panel]
+) -> None:
+    """Draws a PNG: the target gray, the source red, all panels on one scale."""
+    flat = target.shape[1] == 2
+    columns = 2 if flat else len(panels)
+    rows = -(-len(panels) // columns)
+    size = (11, 2.3 * rows) if flat else (3.2 * columns, 3.4 * rows)
+    figure = figure_module().Figure(figsize=size, dpi=130)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    before = _seen(target)
+    drawn = [_seen(moved(p.T_target_source, source.astype(float))) for p in panels]
+    low = np.min([x.min(axis=0) for x in (before, *drawn)], axis=0)
+    high = np.max([x.max(axis=0) for x in (before, *drawn)], axis=0)
+    margin = 0.04 * (high - low).max()
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, panel, here in zip(axes, panels, drawn, strict=False):
+        dot = 3.0 if flat else 9.0 if len(target) < 1000 else 2.5
+        axis.scatter(*before.T, s=dot, color=_TARGET, linewidths=0)
+        axis.scatter(*here.T, s=1.6 * dot, color=_SOURCE, linewidths=0)
+        axis.set_title(panel.title, fontsize=9)
+        axis.set_xlim(low[0] - margin, high[0] + margin)
+        axis.set_ylim(low[1] - margin, high[1] + margin)
+        axis.set_aspect("equal")
+    figure.tight_layout(pad=0.6)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    with atomic_write(path, "wb") as file:
+        file.write(buffer.getvalue())
+
+
+def _seen(points: np.ndarray) -> np.ndarray:
+    """2D points as they are, those in space from a little above and aside."""
+    if points.shape[1] == 2:
+        return points
+    up_second = points[:, [0, 2, 1]] * [1, 1, -1]
+    return (up_second @ tilt(22.0, 35.0).T)[:, :2]
