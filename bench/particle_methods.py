@@ -76,9 +76,7 @@ EXPERIMENTS = {
         [
             Method(
                 PAPER,
-                replace(
-                    sandhu2010(3, 100, prior=_CUBE), prior_steps=7, inner_steps=7
-                ),
+                replace(sandhu2010(3, 100, prior=_CUBE), prior_steps=7, inner_steps=7),
             ),
             Method("the same, R = 3", sandhu2010(3, 100, prior=_CUBE)),
             *_ours(_CUBE),
@@ -97,6 +95,15 @@ EXPERIMENTS = {
             ),
             Method(PAPER, sandhu2010(3, 100, prior=_TRUCK)),
             *_ours(_TRUCK),
+            # As many look-ups, spent otherwise.
+            Method(
+                "  1024 drawn, 288 carried",
+                ParticleFilter(num_prior=1024, num_particles=288, prior=_TRUCK),
+            ),
+            Method(
+                "  1024 drawn, 9 steps each",
+                ParticleFilter(num_prior=1024, prior_steps=9, prior=_TRUCK),
+            ),
         ],
         (0.1, 0.25, 0.5, 1.0, 2.0, 4.0),
         ("no dynamics", "constant velocity", PAPER, DEFAULT),
