@@ -42,7 +42,7 @@ PAPER_TABLE = {
     0.35: ((3.82, 1.11, 7.53), (2.87, 2.05, 8.24)),
 }
 # Trials of the methods that take a fifth of a second each.
-_FEW = 100
+_FEW = 50
 
 
 def ours() -> ParticleFilter:
@@ -83,7 +83,7 @@ class Model(NamedTuple):
     """A target prepared for many sources, in the unit of its own radius."""
 
     cloud: PointCloud
-    index: AbstractIndex
+    closest: AbstractIndex
     centre: Array
     radius: Array
 
@@ -111,7 +111,9 @@ def search(
         points = (points - centre) / model.radius
         cloud = PointCloud(points, jnp.zeros_like(points), mask)
         index = BruteForce.build(points, mask)
-        found = method.solve_indexed(cloud, model.cloud, index, model.index, None, key)
+        found = method.solve_indexed(
+            cloud, model.cloud, index, model.closest, None, key
+        )
         R = lie.rotation(found.T_target_source)
         t = lie.translation(found.T_target_source)
         t = model.radius * t + model.centre - R @ centre

@@ -74,7 +74,13 @@ def outcome(
     degrees, shift = _errors(T, truths, trials.source)
     within = (degrees <= trials.degrees) & (shift <= trials.shift)
     return Outcome(
-        T, degrees[0], shift[0], within[0], within.any(axis=0), status, cpu_ms
+        T,
+        degrees[0],
+        shift[0],
+        within[0],
+        np.any(within, axis=0, keepdims=True)[0],
+        status,
+        cpu_ms,
     )
 
 
