@@ -107,6 +107,10 @@ EXPERIMENTS = {
                 "  1024 drawn, 288 carried",
                 ParticleFilter(num_prior=1024, num_particles=288, prior=_TRUCK),
             ),
+            Method(
+                "  1024 drawn, 9 steps each",
+                ParticleFilter(num_prior=1024, prior_steps=9, prior=_TRUCK),
+            ),
         ],
         (0.1, 0.25, 0.5, 1.0, 2.0, 4.0),
         ("no dynamics", "constant velocity", PAPER, ENSEMBLE, DEFAULT),

@@ -26,7 +26,7 @@ def trial_figure(
 ) -> None:
     """Draws a PNG: the target gray, the source red, all panels on one scale."""
     flat = target.shape[1] == 2
-    columns = 2 if flat else len(panels)
+    columns = 2 if flat else min(4, len(panels))
     rows = -(-len(panels) // columns)
     size = (11, 2.3 * rows) if flat else (3.2 * columns, 3.4 * rows)
     figure = figure_module().Figure(figsize=size, dpi=130)
