@@ -21,10 +21,10 @@ from jaxreg._core.checks import (
 )
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
-from jaxreg.cloud import centroid, rms_radius
+from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.geometry import lie
 from jaxreg.local import AbstractRegistrar, Curvature, Modes, RegistrationSolution
-from jaxreg.particle import AbstractSearch, ParticleFilter
+from jaxreg.particle import ParticleFilter
 
 
 # Sources, targets, masks of both, and initial poses.
@@ -186,16 +186,14 @@ def _register_pair(
         shift = R @ source_mean + lie.translation(T).astype(source.dtype) - target_mean
         return lie.compose(R, shift / radius)
 
-    method = method.in_unit(radius)
-    if isinstance(method, AbstractSearch):
-        method = method.in_frames(centred, d)
+    method = method.in_unit(radius).in_frames(centred, d)
     init = None if init is None else centred(init)
-    solution = method.solve(
-        method.prepare((source - source_mean) / radius, source_mask),
-        method.prepare((target - target_mean) / radius, target_mask),
-        init,
-        key,
+    clouds = _prepared(
+        method,
+        ((source - source_mean) / radius, source_mask),
+        ((target - target_mean) / radius, target_mask),
     )
+    solution = method.solve(*clouds, init, key)
 
     def back(T: Array) -> Array:
         """From the centred and scaled frames to those of the input."""
@@ -226,6 +224,21 @@ def _register_pair(
             solution.modes.fitness,
         ),
     )
+
+
+def _prepared(
+    method: AbstractRegistrar, source: tuple[Array, Array], target: tuple[Array, Array]
+) -> tuple[PointCloud, PointCloud]:
+    """Both clouds as the method wants them."""
+    if source[0].shape != target[0].shape:
+        return method.prepare(*source), method.prepare(*target)
+    # Clouds of one size share a loop, which compiles the preparation once.
+    both = jax.tree.map(lambda *x: jnp.stack(x), source, target)
+    prepared = lax.map(lambda cloud: method.prepare(*cloud), both)
+    source_cloud, target_cloud = (
+        jax.tree.map(lambda x, at=at: x[at], prepared) for at in (0, 1)
+    )
+    return source_cloud, target_cloud
 
 
 def _finite(points: Array, mask: Array) -> tuple[Array, Array]:

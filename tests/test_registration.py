@@ -192,10 +192,37 @@ def test_statuses():
     assert status(point, target) == Status.TOO_FEW_POINTS
     assert status(source, np.full_like(target, np.nan)) == Status.TOO_FEW_POINTS
     assert status(line, target) == Status.LOW_OVERLAP
-    ball = np.random.default_rng(0).standard_normal((M, 3)).astype(np.float32)
-    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-    assert status(ball[:N], ball[::-1]) == Status.AMBIGUOUS
     assert status(source, target, jr.ICP(max_steps=1)) == Status.MAX_STEPS
+
+
+def _cylinder(num: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    angle, height = rng.uniform(0, 2 * np.pi, num), rng.uniform(-2, 2, num)
+    return np.stack([np.cos(angle), np.sin(angle), height], 1).astype(np.float32)
+
+
+def _square(num: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    side = np.stack([rng.uniform(-1, 1, num), np.ones(num)], 1)
+    turn = np.array([[0, -1], [1, 0]])
+    turns = np.stack([np.linalg.matrix_power(turn, k) for k in range(4)])
+    points = np.einsum("nij,nj->ni", turns[rng.integers(0, 4, num)], side)
+    return points.astype(np.float32)
+
+
+@pytest.mark.parametrize("shape", [_cylinder, _square])
+def test_a_symmetric_object_is_ambiguous_and_its_modes_are_the_symmetrys(shape):
+    source, target = shape(N, 0), shape(M, 1)
+    sol = jr.register(source, target, FILTER, key=jax.random.key(0))
+    assert int(sol.status) == Status.AMBIGUOUS
+    modes = np.asarray(sol.modes.T_target_source)[np.asarray(sol.modes.weight) > 0]
+    assert len(modes) > 1
+    d = source.shape[1]
+    turned = modes[0, :d, :d].T @ modes[1, :d, :d]
+    if d == 2:  # a quarter turn, two or three
+        assert np.abs(turned).round(2).sum() == pytest.approx(2, abs=0.2)
+    else:  # about the axis, or upside down
+        assert abs(turned[2, 2]) > 0.99
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The contract of registration methods and what they return."""
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
@@ -88,6 +89,19 @@ class AbstractRegistrar(eqx.Module):
         """The method with its lengths, given in the unit of the input, in `length`s.
 
         Most methods have none: their lengths follow from the data.
+        """
+        return self
+
+    def in_frames(
+        self, centred: Callable[[Motion], Motion], d: int
+    ) -> "AbstractRegistrar":
+        """The method with its poses, given in the frames of the input, in `solve`'s.
+
+        Most methods have none.
+
+        Args:
+            centred: maps a pose from the former frames to the latter.
+            d: dimension of the points.
         """
         return self
 

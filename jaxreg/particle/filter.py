@@ -213,7 +213,9 @@ class ParticleFilter(AbstractSearch):
             batch_size=min(self.batch_size, self.num_prior),
         )
         size = jnp.minimum(self.sample_share * num.astype(dtype), self.num_particles)
-        log_weight = log_weight + log_likelihood(particles.energy, size)
+        points = jnp.maximum(jnp.sum(problem.source_mask), 1).astype(dtype)
+        coldest = self.energy.resolution / points
+        log_weight = log_weight + log_likelihood(particles.energy, size, coldest)
         live = jnp.arange(rows.size) < num
         return particles.weighted(normalised(log_weight, live))
 

@@ -29,14 +29,16 @@ def normalised(
 
 
 def log_likelihood(
-    energy: Float[Array, " p"], target_size: Array | float
+    energy: Float[Array, " p"], target_size: Array | float, coldest: Array | float = 0
 ) -> Float[Array, " p"]:
     """Log p(z_t | x_t) = -energy / temperature, up to a constant; zero at the best.
 
     The paper's exponent, a sum over all points, has the wrong sign and underflows.
     Here the energies themselves set the temperature: the likelihoods have the given
-    effective sample size, so that there is no schedule to choose. Particles whose
-    energy is not finite get -inf; zero for all where that is all of them.
+    effective sample size, so that there is no schedule to choose, or a larger one where
+    the temperature would fall below the `coldest`: poses that the points do not tell
+    apart, as those of a symmetric object, stay equally likely. Particles whose energy
+    is not finite get -inf; zero for all where that is all of them.
     """
     finite = jnp.isfinite(energy)
     low = jnp.min(jnp.where(finite, energy, jnp.inf))
@@ -53,4 +55,5 @@ def log_likelihood(
         return jnp.where(small, middle, cold), jnp.where(small, hot, middle)
 
     temperature = lax.fori_loop(0, 24, halve, (span * 1e-4, span * 1e3))[1]
+    temperature = jnp.maximum(temperature, coldest)
     return jnp.where(jnp.any(finite), -excess / temperature, 0)

@@ -31,6 +31,12 @@ def test_likelihoods_have_the_effective_sample_size_asked_for(seed, share):
     assert log_p.max() == 0
 
 
+def test_energies_nearer_than_the_coldest_temperature_are_nearly_equal():
+    energy = jnp.asarray(np.linspace(0, 1e-3, P), jnp.float32)
+    weight = np.exp(LIKELIHOOD(energy, P / 2, 0.01))
+    np.testing.assert_allclose(weight, 1, atol=0.1)
+
+
 @pytest.mark.parametrize("value", [0.3, np.inf, np.nan])
 def test_equal_or_infinite_energies_give_uniform_weights(value):
     log_p = log_likelihood(jnp.full(P, value, jnp.float32), P / 2)

@@ -1,5 +1,7 @@
 """Absolute energy."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -18,6 +20,7 @@ class AbsoluteEnergy(AbstractEnergy):
         epsilon: smooths the corner at zero, in root mean square radii of the target.
     """
 
+    resolution: ClassVar[float] = 0.0
     epsilon: Array | float = traced(0.01)
 
     def __call__(self, found: Match, width: Scalar) -> Scalar:

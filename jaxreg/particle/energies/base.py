@@ -1,6 +1,7 @@
 """The contract of energies."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +16,14 @@ class AbstractEnergy(eqx.Module):
 
     The paper prints the exponent without its minus. Energies are means over the valid
     source points, so that their number does not matter; the temperature is learned.
+
+    Attributes:
+        resolution: n independent points do not tell energies apart that differ by less
+            than this over n, so the temperature does not fall below that; zero where
+            the energy has no scale of its own.
     """
+
+    resolution: ClassVar[float]
 
     @abc.abstractmethod
     def __call__(self, found: Match, width: Scalar) -> Scalar:

@@ -1,5 +1,7 @@
 """Bounded energy."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 
 from jaxreg._core.typing import Scalar
@@ -14,6 +16,8 @@ class BoundedEnergy(AbstractEnergy):
     cost one, however far away they are. Agreement is the squared cosine between the
     normals, one where there are none.
     """
+
+    resolution: ClassVar[float] = 4.0
 
     def __call__(self, found: Match, width: Scalar) -> Scalar:
         """The share of the source that has no counterpart, softly."""

@@ -1,5 +1,7 @@
 """Squared energy."""
 
+from typing import ClassVar
+
 from jaxreg._core.typing import Scalar
 from jaxreg.local import Match
 from jaxreg.particle.energies.base import AbstractEnergy, mean_over_source
@@ -10,6 +12,8 @@ class SquaredEnergy(AbstractEnergy):
 
     For clouds that overlap fully: a far part without counterpart decides everything.
     """
+
+    resolution: ClassVar[float] = 0.0
 
     def __call__(self, found: Match, width: Scalar) -> Scalar:
         """The L2 energy of ICP."""
