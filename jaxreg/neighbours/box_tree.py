@@ -13,6 +13,8 @@ which order alike; and a value with two users is computed twice unless a loop of
 or more trips returns it.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -20,7 +22,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.neighbours.base import AbstractIndex, Neighbours, map_first
-from jaxreg.neighbours.brute import BruteForce
 from jaxreg.neighbours.order import hilbert_order
 
 
@@ -28,6 +29,9 @@ _LEAF = 32
 _NODE = 16
 _TILE = 128
 _UNROLL = 8
+
+# Ascending squared distances, and the leaves or rows that they belong to.
+_Found = tuple[Array, Array]
 
 
 class BoxTree(AbstractIndex):
@@ -78,20 +82,17 @@ class BoxTree(AbstractIndex):
         self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
     ) -> Int[Array, " n"]:
         """A closest valid target of each query."""
-        d, n = columns.shape
-        columns = lax.stop_gradient(columns)
-        # A query that is not finite would spoil the bounds of its tile.
-        finite = jnp.all(jnp.isfinite(columns), axis=0)
-        columns = jnp.where(finite, columns, self.leaf_points[0, :, :1])
-        tile = min(_TILE, n)
-        padded = jnp.pad(columns, ((0, 0), (0, -n % tile)), mode="edge")
-        tiles = jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
+        n = columns.shape[1]
+        tiles = self._tiles(columns)
         leaf = map_first(self._leaf_of_tile, tiles, num).reshape(-1)[:n]
-        return self._row_in_leaf(columns, leaf)
+        return self._row_in_leaf(lax.stop_gradient(columns), leaf)
 
     def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
-        """By brute force: O(n m) time."""
-        return BruteForce(self.points, self.mask).lookup_nearest(columns, k)
+        """The k closest valid targets of each query; -1 for surplus."""
+        n = columns.shape[1]
+        tiles = self._tiles(columns)
+        row = lax.map(lambda queries: self._rows_of_tile(queries, k), tiles)
+        return jnp.moveaxis(row, 0, 1).reshape(k, -1)[:, :n]
 
     def query(
         self, points: Points, k: int = 1, radius: Scalar | float | None = None
@@ -105,38 +106,85 @@ class BoxTree(AbstractIndex):
         )
         return jax.tree.map(lambda x: x[place], found)
 
+    def _tiles(self, columns: Float[Array, "d n"]) -> Float[Array, "a d t"]:
+        d, n = columns.shape
+        columns = lax.stop_gradient(columns)
+        # A query that is not finite would spoil the bounds of its tile.
+        finite = jnp.all(jnp.isfinite(columns), axis=0)
+        columns = jnp.where(finite, columns, self.leaf_points[0, :, :1])
+        tile = min(_TILE, n)
+        padded = jnp.pad(columns, ((0, 0), (0, -n % tile)), mode="edge")
+        return jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
+
     def _leaf_of_tile(self, queries: Float[Array, "d t"]) -> Int[Array, " t"]:
         """The leaf that holds the closest point of each query."""
+
+        def look(number: Array, found: _Found) -> _Found:
+            best, leaf = found
+            sq = _closest_in_leaf(queries, self.leaf_points, number)
+            return jnp.where(sq < best, sq, best), jnp.where(sq < best, number, leaf)
+
+        # The leaf at the tile's centre comes first: the boxes of many may touch the
+        # tile itself.
+        low, high = jnp.min(queries, axis=1), jnp.max(queries, axis=1)
+        leaf = jnp.full(queries.shape[1], self._leaf_at((low + high) / 2), jnp.int32)
+        best = _closest_in_leaf(queries, self.leaf_points, leaf[0])
+        return self._visit(queries, look, (best, leaf))[1]
+
+    def _rows_of_tile(self, queries: Float[Array, "d t"], k: int) -> Int[Array, "k t"]:
+        """The rows of the k closest points of each query, nearest first."""
+
+        def look(number: Array, found: _Found) -> _Found:
+            points, rows = self.leaf_points[number], self.leaf_rows[number]
+
+            def insert(at: Array, found: _Found) -> _Found:
+                sq, row = found
+                new = _sq_distance(queries, points[:, at])
+                # Ascending lists: what is farther than the new one moves down.
+                above = jnp.pad(sq[:-1], ((1, 0), (0, 0)), constant_values=-jnp.inf)
+                row_above = jnp.pad(row[:-1], ((1, 0), (0, 0)))
+                stays, moves = sq <= new, above > new
+                row = jnp.where(stays, row, jnp.where(moves, row_above, rows[at]))
+                return jnp.where(stays, sq, jnp.where(moves, above, new)), row
+
+            return lax.fori_loop(0, _LEAF, insert, found)
+
+        shape = (k, queries.shape[1])
+        nothing = (
+            jnp.full(shape, jnp.inf, queries.dtype),
+            jnp.full(shape, -1, jnp.int32),
+        )
+        return self._visit(queries, look, nothing)[1]
+
+    def _visit(
+        self,
+        queries: Float[Array, "d t"],
+        look: Callable[[Array, _Found], _Found],
+        found: _Found,
+    ) -> _Found:
+        """Looks at every leaf that may improve the tile's worst answer."""
         low, high = jnp.min(queries, axis=1), jnp.max(queries, axis=1)
         to_nodes = _box_distance(self.node_low, self.node_high, low, high)
         used = _bits(jnp.asarray(jnp.inf, queries.dtype))
 
-        def visit_node(state: tuple[Array, ...]) -> tuple[Array, ...]:
-            _, node, to_nodes, best, leaf = state
+        def visit_node(state: tuple) -> tuple:
+            _, node, to_nodes, found = state
             to_leaves = _box_distance(
                 self.leaf_low[node], self.leaf_high[node], low, high
             )
 
-            def visit_leaf(state: tuple[Array, ...]) -> tuple[Array, ...]:
-                _, at, to_leaves, best, leaf = state
-                number = node * _NODE + at
-                sq = _closest_in_leaf(queries, self.leaf_points, number)
-                closer = sq < best
-                best = jnp.where(closer, sq, best)
-                leaf = jnp.where(closer, number, leaf)
+            def visit_leaf(state: tuple) -> tuple:
+                _, at, to_leaves, found = state
+                found = look(node * _NODE + at, found)
                 to_leaves = jnp.where(jnp.arange(_NODE) == at, used, to_leaves)
-                return (*_next(to_leaves, best), to_leaves, best, leaf)
+                return *_next(to_leaves, found[0]), to_leaves, found
 
-            start = (*_next(to_leaves, best), to_leaves, best, leaf)
-            *_, best, leaf = lax.while_loop(lambda s: s[0], visit_leaf, start)
+            start = *_next(to_leaves, found[0]), to_leaves, found
+            found = lax.while_loop(lambda s: s[0], visit_leaf, start)[-1]
             to_nodes = lax.dynamic_update_index_in_dim(to_nodes, used, node, 0)
-            return (*_next(to_nodes, best), to_nodes, best, leaf)
+            return *_next(to_nodes, found[0]), to_nodes, found
 
-        # The leaf at the tile's centre comes first: the boxes of many may touch the
-        # tile itself.
-        leaf = jnp.full(queries.shape[1], self._leaf_at((low + high) / 2), jnp.int32)
-        best = _closest_in_leaf(queries, self.leaf_points, leaf[0])
-        start = (*_next(to_nodes, best), to_nodes, best, leaf)
+        start = *_next(to_nodes, found[0]), to_nodes, found
         return lax.while_loop(lambda s: s[0], visit_node, start)[-1]
 
     def _leaf_at(self, point: Float[Array, " d"]) -> Int[Array, ""]:
@@ -191,8 +239,12 @@ def _first_least(x: Int[Array, " s"]) -> Int[Array, ""]:
 
 
 def _next(to_boxes: Array, best: Array) -> tuple[Array, Array]:
-    """Whether the closest box may improve the tile's worst answer, and its number."""
-    return jnp.min(to_boxes) < jnp.max(_bits(best)), _first_least(to_boxes)
+    """Whether the closest box may improve the tile's worst answer, and its number.
+
+    Of `(k, t)` answers the last are the worst.
+    """
+    worst = jnp.max(_bits(best if best.ndim == 1 else best[-1]))
+    return jnp.min(to_boxes) < worst, _first_least(to_boxes)
 
 
 def _closest_in_leaf(queries: Array, leaf_points: Array, number: Array) -> Array:

@@ -39,6 +39,20 @@ def test_the_closest_point_is_found(index, d):
     check()
 
 
+@pytest.mark.parametrize("kind", ["random", "duplicated", "collinear"])
+def test_the_tree_finds_the_k_closest_points(kind):
+    target, mask, queries = clouds(kind, 0, 3)
+    found = compiled(BoxTree, k=7)(target, mask, queries)
+    true = np.sort(distances(target, mask, queries), axis=1)[:, :7]
+    mine = np.linalg.norm(queries[:, None] - target[np.asarray(found.index)], axis=2)
+    assert mask[np.asarray(found.index)].all()
+    np.testing.assert_allclose(mine, true, rtol=1e-4, atol=1e-6)
+    rows = np.sort(found.index, axis=1)
+    assert (np.diff(rows, axis=1) > 0).all()  # no point twice
+    few = compiled(BoxTree, k=7)(target, np.arange(M) < 4, queries)
+    np.testing.assert_array_equal(np.asarray(few.valid).sum(1), 4)
+
+
 @pytest.mark.parametrize("index", EXACT)
 def test_the_closest_point_is_found_in_float64(index):
     with jax.enable_x64(True):
