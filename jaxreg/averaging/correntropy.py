@@ -33,7 +33,7 @@ from jaxreg.averaging.iterate import (
 from jaxreg.averaging.laplacian import DENSE_LIMIT
 from jaxreg.averaging.plain import RowsOf, check_rows, iterate_plain, scaled_rows
 from jaxreg.averaging.scales import annealed_width, first_width, gaussian_trust
-from jaxreg.averaging.tree import start
+from jaxreg.averaging.tree import along_frames, start
 from jaxreg.graph.pose_graph import PoseGraph
 
 
@@ -45,7 +45,8 @@ class Correntropy(AbstractAverager):
     standard deviations of the noise that the agreeing edges show, and, up to
     `DENSE_LIMIT` frames, Gauss-Newton steps at the end in which each part counts at
     its precision, or by `information` where the graph has it. `width="paper"` is the
-    published Algorithm 1.
+    published Algorithm 1. Larger graphs take `graduated` steps; where those leave many
+    edges out, the chain of successive frames is tried as a start, too.
 
     Attributes:
         width: "annealed", or "paper" for sigma_k = alpha e_k with the mean residual
@@ -86,8 +87,12 @@ class Correntropy(AbstractAverager):
     ) -> AveragingSolution:
         """Averages a prepared graph."""
         T_start = start(self.initialiser, graph, init, key)
-        solve = self._paper if self.width == "paper" else self._annealed
-        end = solve(graph, T_start)
+        if self.width == "paper":
+            end = self._paper(graph, T_start)
+        elif graph.num_poses <= DENSE_LIMIT:
+            end = self._annealed(graph, T_start)
+        else:
+            end = self._graduated(graph, T_start, init is None)
         return solution(
             graph,
             end.T_world_i,
@@ -123,8 +128,6 @@ class Correntropy(AbstractAverager):
     def _annealed(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
         rows = scaled_rows(self.rows)
         T_start = _better_start(graph, T_start, rows)
-        if graph.num_poses > DENSE_LIMIT:
-            return graduated(graph, T_start, self.max_steps)
         end = iterate(
             graph,
             T_start,
@@ -148,6 +151,14 @@ class Correntropy(AbstractAverager):
         )
         last = last._replace(num_steps=end.num_steps + last.num_steps)
         return gauss_newton_gradients(graph, last, gaussian_trust)
+
+    def _graduated(
+        self, graph: PoseGraph, T_start: Float[Array, "v D D"], also_along_frames: bool
+    ) -> Iterated:
+        starts = [_better_start(graph, T_start, scaled_rows(self.rows))]
+        if also_along_frames:
+            starts.append(along_frames(graph))
+        return graduated(graph, jnp.stack(starts), self.max_steps)
 
 
 def _better_start(

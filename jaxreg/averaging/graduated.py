@@ -1,8 +1,8 @@
 """Robust averaging of large graphs: Levenberg-Marquardt under a shrinking kernel.
 
 Every edge counts by its information and by a Gaussian of its whitened error, whose
-width falls from many deviations, where the problem is near least squares, to five. The
-deviation is that of the middle edge: half of the edges may be wrong.
+width is halved from one that sees the right edges in spite of the drift of the start
+down to ten deviations of the edges inside it.
 """
 
 from typing import NamedTuple
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg.averaging.base import length_scale, masked_quantile
+from jaxreg.averaging.consensus import redundancy
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, precisions
 from jaxreg.averaging.iterate import Iterated
 from jaxreg.averaging.posegraph_lm import (
@@ -27,74 +28,154 @@ from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.robust import Correntropy
 
 
-# Widths in deviations, round by round, and tolerances of the minimisations. At ten,
-# right edges lose nothing, and the wrong ones of large graphs are far beyond.
-_WIDTHS = (40.0, 20.0, 10.0, 10.0, 10.0)
-_TOLERANCES = (1e-2, 1e-2, 1e-3, 1e-3, 1e-6)
-_LATE = (0, 0, 0, 1, 1)
+# The last width in deviations: right edges lose nothing, and the wrong ones of large
+# graphs are far beyond. The first width in deviations, of starts that have spread.
+_DEVIATIONS, _FIRST = 10.0, 40.0
+_COARSE, _FINE = 1e-3, 1e-6
+_ROUNDS = 24
+# No other start is tried if this share of the redundant edges is trusted.
+_SETTLED = 0.95
+# Edges with more trust than this are inside.
+_INSIDE = 0.05
 
 
 class _State(NamedTuple):
     found: Minimum
     parts: Array  # (2,) deviations of a translation and a rotation
-    width: Array
+    width: Array  # of this minimisation
+    next_width: Array
+    round: Array
+
+
+class _Best(NamedTuple):
+    end: _State
+    score: Array
+    tried: Array
+    settled: Array
 
 
 def graduated(
-    graph: PoseGraph, T_start: Float[Array, "v D D"], max_steps: int
+    graph: PoseGraph, starts: Float[Array, "s v D D"], max_steps: int
 ) -> Iterated:
-    """Rounds of scale and minimisation, at most `max_steps` steps each.
+    """The best of the ends from several starts, tried until one leaves few edges out.
 
-    Gradients: implicit at the fixed point, scales are cut.
+    Each start takes rounds of minimisation, at most `max_steps` steps each, under
+    narrower and narrower kernels.
+
+    Gradients: implicit at the fixed point, widths are cut.
     """
-    fixed, T_start = jax.lax.stop_gradient((graph, T_start))
-    ones = jnp.ones_like(graph.weight)
+    fixed, starts = jax.lax.stop_gradient((graph, starts))
 
-    def problem(g: PoseGraph, parts: Array, width: Array) -> Problem:
-        W = precisions(g, ones, parts)
-        return robust_problem(g, log_error, W, Correntropy(), width)
-
-    def turn(s: _State, plan: Array) -> tuple[_State, None]:
-        deviations, tolerance, late = plan
-        parts = _parts(fixed, s.found.T)
-        now = problem(fixed, parts, s.width)
-        squares = now.squares(s.found.T)
-        middle = _deviation(fixed, squares)
-        # Heavy tails of right edges are let in once the kernel keeps wrong ones out.
-        inside = _inside_deviation(fixed, squares, now.trust(squares), s.width)
-        width = deviations * jnp.where(late > 0, jnp.maximum(middle, inside), middle)
-        new = minimise(problem(fixed, parts, width), s.found.T, max_steps, tolerance)
-        return _State(new._replace(step=s.found.step + new.step), parts, width), None
-
-    one = jnp.ones((), T_start.dtype)
-    begin = _State(
-        Minimum(T_start, jnp.asarray(False), jnp.asarray(0, jnp.int32)),
-        jnp.ones((2,), T_start.dtype),
-        one,
-    )
-    plan = jnp.asarray((_WIDTHS, _TOLERANCES, _LATE), one.dtype).T
-    end = jax.lax.scan(turn, begin, plan)[0]
-
-    def trust_of(g: PoseGraph, T: Array, _: Array) -> Array:
-        now = problem(g, end.parts, end.width)
+    def trust_of(g: PoseGraph, T: Array, state: _State) -> Array:
+        now = _problem(g, state.parts, state.width)
         return now.trust(now.squares(T))
 
+    def attempt(b: _Best) -> _Best:
+        end = _narrowed(fixed, starts[b.tried], max_steps)
+        trust = trust_of(fixed, end.found.T, end)
+        score = redundancy(fixed, end.found.T)
+        steps = b.end.found.step + end.found.step
+        better = score > b.score
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, b.end)
+        best = best._replace(found=best.found._replace(step=steps))
+        return _Best(
+            best,
+            jnp.maximum(score, b.score),
+            b.tried + 1,
+            _redundant_share(fixed, trust) > _SETTLED,
+        )
+
+    begin = _Best(
+        _before(fixed, starts[0]),
+        -jnp.ones((), starts.dtype),
+        jnp.asarray(0, jnp.int32),
+        jnp.asarray(False),
+    )
+    end = jax.lax.while_loop(
+        lambda b: (b.tried < starts.shape[0]) & ~b.settled, attempt, begin
+    ).end
     result = Iterated(
         end.found.T,
-        trust_of(fixed, end.found.T, end.parts),
-        _WIDTHS[-1] * end.parts,
+        trust_of(fixed, end.found.T, end),
+        _DEVIATIONS * end.parts,
         end.found.converged,
         end.found.step,
     )
-    return gauss_newton_gradients(graph, result, trust_of)
+    return gauss_newton_gradients(graph, result, lambda g, T, _: trust_of(g, T, end))
 
 
-def _deviation(graph: PoseGraph, squares: Array) -> Array:
-    """Of one whitened component, by the middle edge."""
-    middle = masked_quantile(squares, graph.weight > 0, 0.5)
+def _problem(graph: PoseGraph, parts: Array, width: Array) -> Problem:
+    W = precisions(graph, jnp.ones_like(graph.weight), parts)
+    return robust_problem(graph, log_error, W, Correntropy(), width)
+
+
+def _before(graph: PoseGraph, T_start: Array) -> _State:
+    """Nothing minimised yet."""
+    parts = _parts(graph, T_start, jnp.ones_like(graph.weight))
+    squares = _problem(graph, parts, jnp.ones_like(parts[0])).squares(T_start)
+    width = _first_width(graph, T_start, squares)
+    none = jnp.asarray(0, jnp.int32)
+    start = Minimum(T_start, jnp.asarray(False), none)
+    return _State(start, parts, jnp.full_like(width, jnp.inf), width, none)
+
+
+def _narrowed(graph: PoseGraph, T_start: Array, max_steps: int) -> _State:
+    """Minimises under narrower kernels until the edges inside fill the kernel."""
+
+    def turn(s: _State) -> _State:
+        now = _problem(graph, s.parts, s.next_width)
+        new = minimise(now, s.found.T, max_steps, _COARSE)
+        squares = now.squares(new.T)
+        trust = now.trust(squares)
+        deviation = _inside_deviation(graph, squares, trust, s.next_width)
+        width = jnp.clip(_DEVIATIONS * deviation, 0.5 * s.next_width, s.next_width)
+        width = jnp.maximum(width, 64 * jnp.finfo(width.dtype).eps)
+        new = new._replace(step=s.found.step + new.step)
+        parts = _parts(graph, new.T, trust)
+        return _State(new, parts, s.next_width, width, s.round + 1)
+
+    end = jax.lax.while_loop(
+        lambda s: (s.next_width < 0.95 * s.width) & (s.round < _ROUNDS),
+        turn,
+        _before(graph, T_start),
+    )
+    last = _problem(graph, end.parts, end.next_width)
+    found = minimise(last, end.found.T, max_steps, _FINE)
+    found = found._replace(step=end.found.step + found.step)
+    return end._replace(found=found, width=end.next_width)
+
+
+def _redundant_share(graph: PoseGraph, trust: Array) -> Array:
+    """Trusted edges over all, beyond those that a tree takes."""
+    present = graph.weight > 0
+    tree = graph.num_poses - 1
+    trusted = jnp.sum(present & (trust > 0.5)) - tree
+    return trusted / jnp.maximum(jnp.sum(present) - tree, 1)
+
+
+def _first_width(graph: PoseGraph, T: Array, squares: Array) -> Array:
+    """A width that sees the right edges from the start.
+
+    Starts that have spread their drift show the deviation by their middle edge. One
+    chained along a tree leaves nothing at the edges of its tree and drift at the right
+    ones of the others: twice the lower quartile of those is wide enough.
+    """
+    present, open_edges = graph.weight > 0, _open_edges(graph, T)
+    chained = jnp.sum(present & ~open_edges) > 0.5 * (graph.num_poses - 1)
+    middle = masked_quantile(squares, present, 0.5)
     middle = middle / CHI2_MEDIAN[lie.tangent_dim(graph.dim)]
+    spread = _FIRST * jnp.sqrt(middle * _spare(graph))
+    drift = 2 * jnp.sqrt(masked_quantile(squares, open_edges, 0.25))
     floor = 64 * jnp.finfo(squares.dtype).eps
-    return jnp.maximum(jnp.sqrt(middle * _spare(graph)), floor)
+    return jnp.maximum(jnp.where(chained, drift, spread), floor)
+
+
+def _open_edges(graph: PoseGraph, T: Array) -> Array:
+    """Edges that do not hold exactly."""
+    rotation, translation = graph.differences(T)
+    sq = rotation / 2 + translation / length_scale(graph) ** 2
+    eps = 1e-4 if sq.dtype == jnp.float32 else 1e-8
+    return (graph.weight > 0) & (sq > eps**2)
 
 
 def _inside_deviation(
@@ -111,10 +192,13 @@ def _inside_deviation(
     return jnp.sqrt(ratio / (1 - ratio) * _spare(graph)) * width
 
 
-def _parts(graph: PoseGraph, T: Array) -> Float[Array, "2"]:
-    """Of one component of the translation and of the rotation, by the middle edges."""
+def _parts(graph: PoseGraph, T: Array, trust: Array) -> Float[Array, "2"]:
+    """Of one component of the translation and of the rotation, by the middle edges.
+
+    Among those inside the kernel that do not hold exactly.
+    """
     rotation, translation = graph.differences(T)
-    d, present = graph.dim, graph.weight > 0
+    d, present = graph.dim, _open_edges(graph, T) & (trust > _INSIDE)
     dof = lie.tangent_dim(d) - d
     middle = jnp.stack(
         [

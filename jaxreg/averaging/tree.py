@@ -3,6 +3,7 @@
 from typing import Literal
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Key
@@ -42,6 +43,22 @@ class SpanningTree(AbstractAverager):
         if self.by == "weight":
             return solution(graph, trees.maximum_spanning_tree(*args).T_world_i)
         return solution(graph, trees.shortest_path_poses(*args)[0])
+
+
+def along_frames(graph: PoseGraph) -> Float[Array, "v D D"]:
+    """Poses along the edges between successive frames, and others where none is.
+
+    Large graphs are sequences as a rule, and a recording seldom slips between one
+    frame and the next, while closures of loops may be false.
+    """
+    usual = jnp.max(graph.weight)
+    successive = jnp.abs(graph.edges[:, 0] - graph.edges[:, 1]) == 1
+    weight = jnp.where(
+        (graph.weight > 0) & successive, graph.weight + usual, graph.weight
+    )
+    return trees.maximum_spanning_tree(
+        graph.edges, graph.T_i_j, weight, graph.num_poses
+    ).T_world_i
 
 
 def start(

@@ -1,0 +1,61 @@
+import jax.numpy as jnp
+import numpy as np
+
+from jaxreg import Status
+from jaxreg.averaging import average
+from jaxreg.averaging.laplacian import DENSE_LIMIT
+from jaxreg.graph import PoseGraph
+from jaxreg.metrics import align_poses, translation_errors
+from tests.averaging.graphs import motions, rotations
+
+
+LAP, LAPS = 50, 4
+
+
+def laps_with_false_closures(seed: int):
+    """Laps around a circle of radius 8 m, seen again each lap; true poses, graph."""
+    rng = np.random.default_rng(seed)
+    num = LAP * LAPS
+    angle = 2 * np.pi * np.arange(num) / LAP
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0)
+    X = motions(R, 8 * np.stack([s, 1 - c], axis=1))
+    first = np.arange(num - LAP)
+    chain = np.stack([np.arange(num - 1), np.arange(1, num)], axis=1)
+    closures = np.stack([first, first + LAP], axis=1)
+    true = np.concatenate([chain, closures])
+    noise = motions(
+        rotations(rng, len(true), 2, 0.01), 0.02 * rng.normal(size=(len(true), 2))
+    )
+    T = np.linalg.inv(X[true[:, 0]]) @ X[true[:, 1]] @ noise
+    i, j = np.triu_indices(num, num // 20)
+    pairs = np.stack([i, j], axis=1)
+    pairs = pairs[(i - j) % LAP != 0]
+    count = len(closures) // 5
+    pairs = pairs[rng.choice(len(pairs), count, replace=False)]
+    copied = len(chain) + rng.choice(len(closures), count, replace=False)
+    edges = np.concatenate([true, pairs])
+    graph = PoseGraph.from_edges(
+        edges,
+        np.concatenate([T, T[copied]]).astype(np.float32),
+        num,
+        information=np.tile(
+            np.diag([2500, 2500, 1e4]).astype(np.float32), (len(edges), 1, 1)
+        ),
+    )
+    return X, graph, np.arange(len(edges)) >= len(true)
+
+
+def test_false_closures_of_a_large_graph_are_found():
+    for seed in range(2):
+        X, graph, false = laps_with_false_closures(seed)
+        assert graph.num_poses > DENSE_LIMIT
+        solution = average(graph)
+        assert solution.status == Status.CONVERGED
+        true = jnp.asarray(X, jnp.float32)
+        T = align_poses(solution.T_world_i, true, "best")
+        assert float(jnp.max(translation_errors(T, true))) < 0.3
+        trusted = np.asarray(solution.edge_weight) > 0.5
+        # Neighbouring places look alike to within the last width of the kernel.
+        assert np.mean(trusted[false]) < 0.1
+        assert np.mean(trusted[~false]) > 0.99
