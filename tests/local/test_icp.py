@@ -92,10 +92,10 @@ def test_scale_is_found_with_the_pose_if_asked(near, factor):
     assert int(sol.status) == Status.CONVERGED
     block = np.asarray(sol.T_target_source, np.float64)[:3, :3] * factor
     np.testing.assert_allclose(block @ block.T, np.eye(3), atol=0.02)
-    moved = move(sol.T_target_source, np.float32(factor) * source)
+    moved = move(np.asarray(sol.T_target_source), np.float32(factor) * source)
     assert np.abs(moved - move(T, source)).max() < 0.05
     # The guess's scale is taken from its block.
-    start = np.diag(np.float32([1 / factor] * 3 + [1])) @ np.eye(4, dtype=np.float32)
+    start = np.diag(np.array([1 / factor] * 3 + [1], np.float32))
     again = jr.register(np.float32(factor) * source, target, method, init=start)
     np.testing.assert_allclose(again.T_target_source, sol.T_target_source, atol=0.02)
 

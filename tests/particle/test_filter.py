@@ -1,5 +1,7 @@
 """The filter, its preset and its rival, on small problems."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -193,6 +195,7 @@ def test_the_papers_settings():
 
 
 class _Constant(AbstractEnergy):
+    resolution: ClassVar[float] = 0.0
     value: Array | float = traced(0.5)
 
     def __call__(self, found, width):
