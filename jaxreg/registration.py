@@ -1,8 +1,6 @@
 """`register`: the pose of one point set in the frame of another."""
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -20,6 +18,7 @@ from jaxreg._core.checks import (
     is_concrete,
 )
 from jaxreg._core.status import Status
+from jaxreg._core.threads import map_in_threads, num_cores
 from jaxreg._core.typing import Key
 from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.geometry import lie
@@ -110,7 +109,7 @@ def register(
     keys = None if key is None else jax.random.split(key, num)
     every = (method, flat, keys)
     threads = all(map(is_concrete, jax.tree.leaves(every)))
-    threads = threads and jax.default_backend() == "cpu"
+    threads = threads and num > 0 and jax.default_backend() == "cpu"
     solution = _in_threads(*every) if threads else _register_rows(*every, num, 0)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solution)
 
@@ -142,9 +141,8 @@ def _register_rows(
 def _in_threads(
     method: AbstractRegistrar, pairs: _Pairs, keys: Array | None
 ) -> RegistrationSolution:
-    """Chunks of a batch on all cores of a CPU: XLA runs a loop on one."""
-    num = pairs[0].shape[0]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    """Chunks of a batch, as many at a time as there are cores."""
+    num, cores = pairs[0].shape[0], num_cores()
     chunk = num if cores == 1 else max(num // (4 * cores), 1)
 
     def run(start: int) -> RegistrationSolution:
@@ -152,10 +150,7 @@ def _in_threads(
         found = _register_rows(method, pairs, keys, chunk, jnp.asarray(first))
         return jax.tree.map(lambda x: np.asarray(x)[start - first :], found)
 
-    starts = range(0, num, chunk)
-    parts = [run(0)]  # compiles; the threads then share the program
-    with ThreadPoolExecutor(cores) as pool:
-        parts += pool.map(run, starts[1:])
+    parts = map_in_threads(run, range(0, num, chunk), cores)
     return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts)
 
 

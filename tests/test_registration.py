@@ -162,6 +162,16 @@ def test_icp_gradient_agrees_with_central_differences():
         assert float(jax.grad(x)(0.0)) == pytest.approx(float(numeric), rel=1e-4)
 
 
+def test_threads_keep_the_precision_of_the_caller():
+    with jax.enable_x64(True):
+        source, target, T = _pair(3, 3, angle=0.2)
+        pairs = [np.stack([x.astype(float)] * 3) for x in (source, target)]
+        sol = jr.register(pairs[0], pairs[1], jr.ICP(), init=T.astype(float))
+        assert sol.T_target_source.dtype == np.float64
+        first, last = np.asarray(sol.T_target_source)[[0, -1]]
+        np.testing.assert_array_equal(first, last)
+
+
 def test_masked_and_non_finite_rows_do_not_count():
     source, target, T = _pair(3, 3, angle=0.5)
     init = motion(9, 3, angle=0.1, shift=0.05) @ T

@@ -91,7 +91,10 @@ def cells_in_order(
 def at_most(
     cap: int, points: Points, mask: Mask, low: Float[Array, " d"], side: Scalar
 ) -> tuple[Float[Array, ""], Int[Array, " n"], Int[Array, " n"]]:
-    """The size at which nearly and at most `cap` cells are filled, and their order."""
+    """The size at which nearly and at most `cap` cells are filled, and their order.
+
+    Of more than `cap` points: the first order is not one, but a key each.
+    """
 
     def too_many(state: tuple[Array, Array, Array]) -> Array:
         size, _, keys = state

@@ -1,7 +1,6 @@
 """Registration by kernel correlation, the rival in the PF paper's section 5.1."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -20,10 +19,10 @@ from jaxreg.local import (
     Modes,
     RegistrationSolution,
     Score,
+    sandwich,
     score_both_ways,
     turn_and_shift,
 )
-from jaxreg.local.steps.tiny_solve import solve_semidefinite
 from jaxreg.neighbours import exact_index
 
 
@@ -192,5 +191,4 @@ def _covariance(
     by_target = pull_on_target(T_target_source, source, target, bandwidth)
     pulls = jnp.concatenate([model.by_source, by_target], axis=1)
     meat = jnp.matmul(pulls, pulls.T, precision=lax.Precision.HIGHEST)
-    half = jax.vmap(solve_semidefinite, (None, 1), 1)(model.H, meat)
-    return jax.vmap(solve_semidefinite, (None, 1), 1)(model.H, half.T)
+    return sandwich(model.H, meat)

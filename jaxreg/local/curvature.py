@@ -45,10 +45,7 @@ class Curvature(eqx.Module):
         """At the pose of a match."""
         H, b = residual.normal_equations(found, weight)
         meat = weighted_gram(residual.descents(found), weight * weight)
-        eye = jnp.eye(b.shape[0], dtype=b.dtype)
-        bread = jax.vmap(solve_semidefinite, (None, 1), 1)(H, eye)
-        covariance = full_matmul(bread, full_matmul(meat, bread.T))
-        return cls(H, b, residual.energy(found, weight), covariance)
+        return cls(H, b, residual.energy(found, weight), sandwich(H, meat))
 
     def scaled(self, length: Float[Array, ""]) -> "Curvature":
         """In a unit of length that is 1 / `length` times the present one."""
@@ -61,6 +58,13 @@ class Curvature(eqx.Module):
             error=self.error * sq,
             covariance=self.covariance * jnp.outer(unit, unit),
         )
+
+
+def sandwich(H: Float[Array, "k k"], meat: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    """H^-1 meat H^-1, without the directions that H leaves free (Huber 1967)."""
+    eye = jnp.eye(H.shape[0], dtype=H.dtype)
+    bread = jax.vmap(solve_semidefinite, (None, 1), 1)(H, eye)
+    return full_matmul(bread, full_matmul(meat, bread.T))
 
 
 def is_degenerate(

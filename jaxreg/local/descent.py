@@ -32,7 +32,7 @@ class Descent(eqx.Module):
         width: kernel width.
         num_steps: steps taken.
         moving: False once a step was small.
-        fine: whether all source points are matched.
+        fine: whether the next step matches all source points, as the last one does.
     """
 
     T: Float[Array, "D D"]
@@ -64,6 +64,12 @@ class Limits(eqx.Module):
     floor: Scalar
     tolerance: Scalar
 
+    def stride(self, num_points: int) -> int:
+        """The step between the source points that a descent begins with."""
+        if self.max_steps == 1:  # the last step counts all points
+            return 1
+        return max(1, min(_MAX_STRIDE, num_points // _MIN_COARSE_POINTS))
+
     def within_reach(self, found: Match) -> Match:
         """The match with the pairs that are too far apart masked."""
         near = found.sq_residual <= self.farthest**2
@@ -83,7 +89,7 @@ def descend(
 ) -> Descent:
     """Descends from a pose and a scale; nothing is differentiated."""
     n = problem.source.shape[1]
-    step = stride(n)
+    step = limits.stride(n)
     coarse = problem.every(step).padded(n)
 
     def body(state: Descent) -> Descent:
@@ -118,10 +124,20 @@ def descend(
             width=width,
             num_steps=state.num_steps + 1,
             moving=~state.fine | (change > limits.tolerance) | falling,
-            fine=state.fine | (change < _COARSE_TOLERANCE),
+            fine=state.fine
+            | (change < _COARSE_TOLERANCE)
+            | (state.num_steps + 2 >= limits.max_steps),
         )
 
-    start = Descent(
+    return lax.while_loop(
+        lambda s: s.moving & (s.num_steps < limits.max_steps),
+        body,
+        _before(init, scale, n, fine=step == 1),
+    )
+
+
+def _before(init: Motion, scale: Scalar, n: int, *, fine: bool) -> Descent:
+    return Descent(
         T=init,
         scale=scale,
         T_matched=init,
@@ -131,16 +147,8 @@ def descend(
         width=jnp.asarray(jnp.inf, init.dtype),
         num_steps=jnp.zeros((), jnp.int32),
         moving=jnp.asarray(True),
-        fine=jnp.asarray(step == 1),
+        fine=jnp.asarray(fine),
     )
-    return lax.while_loop(
-        lambda s: s.moving & (s.num_steps < limits.max_steps), body, start
-    )
-
-
-def stride(num_points: int) -> int:
-    """The step between the source points that a descent begins with."""
-    return max(1, min(_MAX_STRIDE, num_points // _MIN_COARSE_POINTS))
 
 
 def _either(fine: Array, problem: Problem, coarse: Problem) -> Problem:

@@ -18,7 +18,7 @@ from jaxreg.cloud import PointCloud, median_spacing, rms_radius, thin
 from jaxreg.geometry import lie
 from jaxreg.local.base import AbstractRegistrar, Modes, RegistrationSolution
 from jaxreg.local.curvature import Curvature, is_degenerate
-from jaxreg.local.descent import Descent, Limits, descend, stride
+from jaxreg.local.descent import Descent, Limits, descend
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.problem import Match, Problem, match
 from jaxreg.local.residuals import AbstractResidual, PlaneToPlane
@@ -106,18 +106,12 @@ class ICP(AbstractRegistrar):
         """Descends from `init` in the prepared frames."""
         dtype = source.points.dtype
         self = cast_floats(self, dtype)
-        init, scale = self._start(source, target, init)
+        init, start_scale = self._start(source, target, init)
         spacing = median_spacing(target.points, target.mask)
         problem = Problem.of(source, target, self._indexed(target))
-        limits = Limits(
-            max_steps=self.max_steps,
-            with_scale=self.with_scale,
-            farthest=jnp.asarray(self.max_correspondence_distance, dtype),
-            floor=self.width_end * spacing,
-            tolerance=jnp.asarray(self.tolerance, dtype),
-        )
-        frozen, init, scale = lax.stop_gradient((problem, init, scale))
-        end = descend(self._optimiser, frozen, init, scale, limits)
+        limits = self._limits(spacing)
+        frozen, init, start_scale = lax.stop_gradient((problem, init, start_scale))
+        end = descend(self._optimiser, frozen, init, start_scale, limits)
 
         scale = end.scale_matched
         found = match(problem.scaled(scale), end.T_matched, end.row)
@@ -129,6 +123,7 @@ class ICP(AbstractRegistrar):
         T = self._last_step(end.T_matched, found, weight)
         worse = self._worse_than(end, frozen, lax.stop_gradient(found), limits)
         T = jnp.where(worse, init, T)
+        scale = jnp.where(worse, start_scale, scale)
 
         spacing = jnp.maximum(
             spacing, scale * median_spacing(source.points, source.mask)
@@ -163,6 +158,15 @@ class ICP(AbstractRegistrar):
     @property
     def _optimiser(self) -> LocalOptimiser:
         return LocalOptimiser(self.residual, self.kernel, self.step)
+
+    def _limits(self, spacing: Scalar) -> Limits:
+        return Limits(
+            max_steps=self.max_steps,
+            with_scale=self.with_scale,
+            farthest=jnp.asarray(self.max_correspondence_distance, spacing.dtype),
+            floor=self.width_end * spacing,
+            tolerance=jnp.asarray(self.tolerance, spacing.dtype),
+        )
 
     def _indexed(self, cloud: PointCloud) -> AbstractIndex:
         index = self.index or exact_index(cloud.points.shape[0])
@@ -201,7 +205,7 @@ class ICP(AbstractRegistrar):
         self, end: Descent, problem: Problem, found: Match, limits: Limits
     ) -> Bool[Array, ""]:
         """Whether the guess fits better than the match at the end."""
-        every = stride(found.mask.shape[0])
+        every = limits.stride(found.mask.shape[0])
         mask = problem.every(every).source_mask
 
         def loss(sq_residual: Array) -> Array:

@@ -7,8 +7,7 @@ with arrays, a thin loop around them divides the pairs into batches, runs two at
 time, and reports progress.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -24,6 +23,7 @@ from jaxreg._core.checks import (
     is_concrete,
 )
 from jaxreg._core.status import Status
+from jaxreg._core.threads import map_in_threads
 from jaxreg._core.typing import Key, Progress, StatusArray
 from jaxreg.averaging import AbstractAverager
 from jaxreg.geometry import lie
@@ -197,27 +197,12 @@ def _motions_in_batches(
 
     starts = range(0, total, _PAIRS_PER_BATCH)
     report("registering pairs", 0, total)
-    batches = [run(0)]  # compiles; the threads then share the program
-    report("registering pairs", min(_PAIRS_PER_BATCH, total), total)
-    with ThreadPoolExecutor(_THREADS) as pool:
-        for batch in _in_order(pool, run, starts[1:]):
-            batches.append(batch)
-            done = min(len(batches) * _PAIRS_PER_BATCH, total)
-            report("registering pairs", done, total)
+    batches = []
+    for batch in map_in_threads(run, starts, _THREADS):
+        batches.append(batch)
+        done = min(len(batches) * _PAIRS_PER_BATCH, total)
+        report("registering pairs", done, total)
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:total], *batches)
-
-
-def _in_order(
-    pool: ThreadPoolExecutor,
-    run: Callable[[int], RelativeMotions],
-    starts: range,
-) -> Iterator[RelativeMotions]:
-    """Results in order; on an interruption, batches not begun are dropped."""
-    try:
-        yield from pool.map(run, starts)
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise
 
 
 @eqx.filter_jit

@@ -60,6 +60,8 @@ def correspondences(
     check_motion(T, d, "T_target_source")
     source_mask = check_mask(source_mask, source.shape[:-1], "source_mask")
     target_mask = check_mask(target_mask, target.shape[:-1], "target_mask")
+    if max_distance is not None:  # an array: another distance compiles nothing
+        max_distance = jnp.asarray(max_distance, source.dtype)
     return _find(source, target, T, max_distance, source_mask, target_mask)
 
 
@@ -68,11 +70,10 @@ def _find(
     source: Array,
     target: Array,
     T: Array,
-    max_distance: float | Array | None,
+    max_distance: Array | None,
     source_mask: Array,
     target_mask: Array,
 ) -> Neighbours:
     index = exact_index(target.shape[0]).build(target, target_mask)
-    radius = None if max_distance is None else jnp.asarray(max_distance, source.dtype)
-    found = index.query(lie.act(T, source), radius=radius)
+    found = index.query(lie.act(T, source), radius=max_distance)
     return eqx.tree_at(lambda f: f.valid, found, found.valid & source_mask)

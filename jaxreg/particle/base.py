@@ -69,12 +69,7 @@ class AbstractSearch(AbstractRegistrar):
     def in_frames(
         self, centred: Callable[[Motion], Motion], d: int
     ) -> "AbstractSearch":
-        """With poses given in the frames of the input in those of `solve`.
-
-        Args:
-            centred: maps a pose from the former to the latter.
-            d: dimension of the points.
-        """
+        """With the prior's poses in the frames of `solve`."""
         if self.prior is None:
             return self
         return eqx.tree_at(lambda m: m.prior, self, self.prior.in_frames(centred, d))

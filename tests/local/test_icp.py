@@ -100,6 +100,20 @@ def test_scale_is_found_with_the_pose_if_asked(near, factor):
     np.testing.assert_allclose(again.T_target_source, sol.T_target_source, atol=0.02)
 
 
+def test_steps_that_run_out_early_end_with_all_points():
+    # Enough points that a descent begins with some of them.
+    source, T = blob(2000, 3, seed=1), motion(3, 3, angle=0.6)
+    target = move(T, blob(2000, 3, seed=2))
+    sol = jr.register(source, target, jr.ICP(max_steps=2), init=np.eye(4))
+    assert int(sol.status) == Status.MAX_STEPS
+    start, _ = pose_error(jnp.eye(4), T)
+    angle, _ = pose_error(sol.T_target_source, T)
+    assert angle < 0.6 * start
+    # The last match is of each point with its closest one: the energy is small.
+    far = jr.correspondences(source, target, np.eye(4, dtype=np.float32)).sq_distance
+    assert float(sol.error) < float(np.sum(far)) / 2
+
+
 def test_without_asking_the_answer_is_rigid(near):
     source, target, _, init, _ = near
     sol = jr.register(np.float32(1.1) * source, target, jr.ICP(), init=init)
