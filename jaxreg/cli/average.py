@@ -27,7 +27,7 @@ from jaxreg.io.g2o import read_g2o, read_g2o_poses, write_g2o
 from jaxreg.io.result import versions, write_json
 from jaxreg.io.tum import write_tum
 from jaxreg.metrics import chordal_objective
-from jaxreg.plot.graph import graph_figure
+from jaxreg.plot import graph_figure, write_graph_report
 
 
 METHODS = {
@@ -35,7 +35,7 @@ METHODS = {
     "plain": MotionAveraging,
     "weighted": WeightedMotionAveraging,
 }
-FILES = ("result.json", "poses.tum", "graph.g2o", "figure.png")
+FILES = ("result.json", "poses.tum", "graph.g2o", "figure.png", "report.html")
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,16 @@ class Average(Options):
                 "versions": versions(),
             }
             write_json(staging / "result.json", document)
+            with outputs.page_or_message(session):
+                write_graph_report(
+                    staging / "report.html",
+                    graph,
+                    sol,
+                    before,
+                    ids.tolist(),
+                    details=outputs.page_details(session, document)
+                    | {k: document[k] for k in ("objective_before", "objective_after")},
+                )
 
 
 def _document(

@@ -18,7 +18,14 @@ from jaxreg.io.result import Result
 from jaxreg.io.stanford import read_conf
 
 
-FILES = ("result.json", "poses.tum", "graph.g2o", "merged.ply", "figure.png")
+FILES = (
+    "result.json",
+    "poses.tum",
+    "graph.g2o",
+    "merged.ply",
+    "figure.png",
+    "report.html",
+)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """From solutions to results in the frames of the files; the tables on the screen."""
 
-from collections.abc import Sequence
+import contextlib
+import dataclasses
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +13,10 @@ from rich.table import Table
 from jaxreg._core.status import Status
 from jaxreg.cli.runtime import Session
 from jaxreg.io.atomic import atomic_folder
+from jaxreg.io.errors import MissingExtraError
 from jaxreg.io.result import Result, result_document, write_result
 from jaxreg.metrics import rotation_errors, translation_errors
-from jaxreg.plot.figure import reconstruction_figure
+from jaxreg.plot import reconstruction_figure, write_report
 
 
 def uncentre(
@@ -49,8 +52,19 @@ def write_files(
     result: Result,
     scans: Sequence[np.ndarray],
     errors: dict[str, Any] | None = None,
+    modes: tuple[np.ndarray, ...] | None = None,
+    covariances: np.ndarray | None = None,
 ) -> None:
-    """Writes all files of a result into the folder of `--out`, or none."""
+    """Writes all files of a result into the folder of `--out`, or none.
+
+    Args:
+        session: the command.
+        result: poses and pairs.
+        scans: `(n_i, d)` arrays.
+        errors: against a known truth, see `pose_errors`.
+        modes: other poses of the second of two scans, for the page.
+        covariances: `(v, k, k)` of the poses, for the page.
+    """
     with atomic_folder(session.options.out) as staging:
         with session.timed("write"):
             reconstruction_figure(
@@ -68,6 +82,40 @@ def write_files(
             errors=errors,
         )
         write_result(staging, result, scans, document)
+        with page_or_message(session):
+            write_report(
+                staging / "report.html",
+                scans,
+                result,
+                modes=modes,
+                covariances=covariances,
+                errors=errors,
+                details=page_details(session, document),
+            )
+
+
+@contextlib.contextmanager
+def page_or_message(session: Session) -> Iterator[None]:
+    """Says that the page was left out if its library is missing: files go on."""
+    try:
+        yield
+    except MissingExtraError as err:
+        session.console.print(str(err))
+
+
+def page_details(session: Session, document: dict[str, Any]) -> dict[str, Any]:
+    """What the page tells of how a result was made: part of the document, settings."""
+    options = dataclasses.asdict(session.options)
+    settings = {
+        k: _setting(v) for k, v in options.items() if k not in ("seed", "quiet")
+    }
+    keys = ("command", "seed", "times_s", "versions")
+    return {k: document[k] for k in keys} | {"settings": settings}
+
+
+def _setting(value: Any) -> str:
+    parts = value if isinstance(value, tuple) else (value,)
+    return ", ".join("none" if v is None else str(v) for v in parts)
 
 
 def pose_errors(
@@ -148,7 +196,8 @@ def show_errors(session: Session, errors: dict[str, Any]) -> None:
 
 
 def show_end(session: Session, files: Sequence[str], folder: Path) -> None:
-    """Prints what took how long and what was written."""
+    """Prints what took how long and what was written, of the files there may be."""
+    files = [name for name in files if (folder / name).exists()]
     parts = ", ".join(f"{name} {s:.1f} s" for name, s in session.times.items())
     session.console.print(f"Times: {parts}.")
     session.console.print(f"Written to {folder}: {', '.join(files)}.")

@@ -40,19 +40,24 @@ class Register(Options):
         key = self.key()
         with session.progress() as progress, session.timed("run", computes=True):
             progress("registering", 0, 1)
-            result = _register(scans, key)
+            result, modes, covariances = _register(scans, key)
             progress("registering", 1, 1)
         if not result.placed[1]:
             raise InputError(
                 f"{self.source} onto {self.target}: {result.status.name}.\n"
                 f"{result.status.advice}"
             )
-        outputs.write_files(session, result, scans.points)
+        outputs.write_files(
+            session, result, scans.points, modes=modes, covariances=covariances
+        )
         _show(session, result)
         return 0
 
 
-def _register(scans: Scans, key: jax.Array) -> Result:
+def _register(
+    scans: Scans, key: jax.Array
+) -> tuple[Result, tuple[np.ndarray, ...], np.ndarray]:
+    """The result, the modes of the posterior, and the covariances of both poses."""
     import jaxreg
 
     centred, middles = scans.centred()
@@ -64,7 +69,7 @@ def _register(scans: Scans, key: jax.Array) -> Result:
         np.asarray(sol.T_target_source)[None], middles[0], middles[1]
     )
     rows = np.array([len(x) for x in scans.points])
-    return Result(
+    result = Result(
         names=scans.names,
         T_world_i=np.stack([np.eye(len(T_target_source[0])), T_target_source[0]]),
         placed=np.array([True, found]),
@@ -78,6 +83,12 @@ def _register(scans: Scans, key: jax.Array) -> Result:
         weight=np.array([float(found)]),
         inlier_rmse=np.array([float(sol.inlier_rmse)]),
     )
+    moved = outputs.uncentre(
+        np.asarray(sol.modes.T_target_source), middles[0], middles[1]
+    )
+    modes = (moved, np.asarray(sol.modes.weight), np.asarray(sol.modes.fitness))
+    covariance = np.asarray(sol.covariance)
+    return result, modes, np.stack([np.zeros_like(covariance), covariance])
 
 
 def _show(session: Session, result: Result) -> None:

@@ -20,7 +20,14 @@ from jaxreg.io import read_points, read_tum
 
 RNG = np.random.default_rng(0)
 CLOUD = RNG.normal(size=(40, 3))
-FILES = ["figure.png", "graph.g2o", "merged.ply", "poses.tum", "result.json"]
+FILES = [
+    "figure.png",
+    "graph.g2o",
+    "merged.ply",
+    "poses.tum",
+    "report.html",
+    "result.json",
+]
 
 
 @pytest.fixture
@@ -211,6 +218,15 @@ def test_dropped_rows_are_counted(
     assert len(read_points("jaxreg-out/merged.ply")) == 120
 
 
+def _modes(T: np.ndarray) -> SimpleNamespace:
+    """One pose that the search ended in, and an unused row."""
+    return SimpleNamespace(
+        T_target_source=jnp.stack([T, T]),
+        weight=jnp.asarray([1.0, 0.0]),
+        fitness=jnp.asarray([0.95, 0.0]),
+    )
+
+
 def test_register_writes_the_motion_between_the_files(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -225,6 +241,8 @@ def test_register_writes_the_motion_between_the_files(
             fitness=jnp.asarray(0.95),
             overlap=jnp.asarray(0.93),
             inlier_rmse=jnp.asarray(0.02),
+            covariance=1e-6 * jnp.eye(6),
+            modes=_modes(T),
         )
 
     monkeypatch.setattr(jaxreg, "register", register)
@@ -252,6 +270,8 @@ def test_register_without_overlap_exits_with_2(
             fitness=jnp.asarray(0.0),
             overlap=jnp.asarray(0.0),
             inlier_rmse=jnp.asarray(jnp.nan),
+            covariance=jnp.full((6, 6), jnp.nan),
+            modes=_modes(np.full((4, 4), np.nan)),
         )
 
     monkeypatch.setattr(jaxreg, "register", register)

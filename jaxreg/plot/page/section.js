@@ -1,0 +1,115 @@
+// The movable cut through the model: a slab across one axis of the common frame.
+
+const AXES = ["x", "y", "z"];
+let ORDER = null; // points of all scans in random order, so that no scan hides others
+
+function cutRange() {
+  const { box } = arranged("after");
+  const [low, high] = box[state.axis];
+  const total = POINTS.reduce((sum, p, i) => sum + (DATA.scans[i].placed ? p.n : 0), 0);
+  // Thick enough for some 1600 points, thin enough to be a cut.
+  const width = Math.min(Math.max(1600 / (total + 1), 0.004), 0.03) * (high - low);
+  return { low, high, width, at: low + state.cut * (high - low) };
+}
+
+function shuffled() {
+  const order = [];
+  POINTS.forEach((p, i) => { for (let k = 0; k < p.n; k++) order.push(i, k); });
+  let seed = 1;
+  for (let m = order.length / 2 - 1; m > 0; m--) {
+    seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0;
+    const r = seed % (m + 1);
+    for (const s of [0, 1]) {
+      [order[2 * m + s], order[2 * r + s]] = [order[2 * r + s], order[2 * m + s]];
+    }
+  }
+  return Int32Array.from(order);
+}
+
+function visibleAfter(i) {
+  return DATA.scans[i].placed && (state.only ? state.only.includes(i) : state.shown[i]);
+}
+
+function slabTraces() {
+  const { parts } = arranged("after");
+  const { at, width } = cutRange();
+  const [u, v] = [0, 1, 2].filter((a) => a !== state.axis);
+  const shown = DATA.scans.map((_, i) => visibleAfter(i));
+  const [x, y, color] = [[], [], []];
+  for (let m = 0; m < ORDER.length; m += 2) {
+    const [i, k] = [ORDER[m], ORDER[m + 1]];
+    if (!shown[i] || Math.abs(parts[i][state.axis][k] - at) > width / 2) continue;
+    x.push(parts[i][u][k]);
+    y.push(parts[i][v][k]);
+    color.push(rgb(state.color === "scan" ? DATA.scans[i].color : heat(POINTS[i].distance[k])));
+  }
+  return [{ type: "scattergl", mode: "markers", x, y, hoverinfo: "skip",
+    marker: { size: 4, color, line: { width: 0 } } }];
+}
+
+function slabLayout() {
+  const { box } = arranged("after");
+  const [u, v] = [0, 1, 2].filter((a) => a !== state.axis);
+  const axis = (a) => {
+    const grow = 0.04 * (box[a][1] - box[a][0]) + 1e-12;
+    return { range: [box[a][0] - grow, box[a][1] + grow], showgrid: false, zeroline: false,
+      showticklabels: false, title: { text: AXES[a], standoff: 2 } };
+  };
+  return {
+    margin: { l: 24, r: 6, t: 6, b: 24 }, dragmode: "pan", uirevision: String(state.axis),
+    paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    font: { color: theme("--soft"), size: 11 }, showlegend: false,
+    xaxis: axis(u), yaxis: { ...axis(v), scaleanchor: "x" },
+  };
+}
+
+// Where the cut lies, drawn into the 3D view.
+function cutOutline() {
+  const { box } = arranged("after");
+  const { at } = cutRange();
+  const [u, v] = [0, 1, 2].filter((a) => a !== state.axis);
+  const corners = [[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]].map(([p, q]) => {
+    const c = [0, 0, 0];
+    c[state.axis] = at;
+    c[u] = box[u][p];
+    c[v] = box[v][q];
+    return c;
+  });
+  const [x, y, z] = [0, 1, 2].map((a) => corners.map((c) => c[a]));
+  return { type: "scatter3d", mode: "lines", x, y, z, hoverinfo: "skip", showlegend: false,
+    line: { color: theme("--accent"), width: 3 }, visible: state.when === "after" };
+}
+
+let cutting = false;
+
+function drawSlab() {
+  if (cutting) return;
+  cutting = true;
+  requestAnimationFrame(() => {
+    cutting = false;
+    const { at, width } = cutRange();
+    const { origin } = arranged("after");
+    $("cut-at").textContent =
+      `${AXES[state.axis]} = ${number(at + origin[state.axis], 3)}, ${number(width, 2)} thick`;
+    Plotly.react("slab", slabTraces(), slabLayout(), CONFIG);
+  });
+}
+
+function startSection() {
+  $("section-card").hidden = false;
+  ORDER = shuffled();
+  // Across the axis that the viewer looks along.
+  const toward = DATA.camera[2].map(Math.abs);
+  state.axis = toward.indexOf(Math.max(...toward));
+  choice("axis", AXES.map((name, a) => [a, name]), "axis");
+  // The outline in the 3D view follows when the slider rests: it redraws all points.
+  let rest = 0;
+  $("cut").addEventListener("input", () => {
+    state.cut = Number($("cut").value) / 1000;
+    drawSlab();
+    clearTimeout(rest);
+    rest = setTimeout(drawScene, 120);
+  });
+  listeners.push(drawSlab);
+  drawSlab();
+}
