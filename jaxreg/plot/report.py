@@ -148,6 +148,7 @@ def write_graph_report(
         "title": title,
         "dim": graph.dim,
         "status": _status(Status(int(solution.status))),
+        "camera": _camera_on_path(T),
         "num_placed": int(placed.sum()),
         "num_poses": len(T),
         "num_trusted": int(np.sum(weight > 0.5)),
@@ -217,7 +218,7 @@ def _result(
 def _camera(
     clouds: list[np.ndarray], T_world_i: np.ndarray, placed: np.ndarray
 ) -> np.ndarray | None:
-    """Rows right, up and towards the viewer, as in the picture of the result."""
+    """Rows right, up and towards the viewer."""
     if clouds[0].shape[1] == 2:
         return None
     model = [
@@ -225,7 +226,20 @@ def _camera(
         for x, T, ok in zip(clouds, T_world_i, placed, strict=True)
         if ok
     ]
-    return tilt(20.0, 25.0) @ principal_axes(np.concatenate(model))[0]
+    axes, _ = principal_axes(np.concatenate(model))
+    up = 1 + int(np.argmax(np.abs(axes[1, 1:])))
+    if axes[1, up] < 0:
+        # Files have y or z upwards, if anything: no model shall stand on its head.
+        axes = axes * np.array([[-1], [-1], [1]])
+    return tilt(20.0, 25.0) @ axes
+
+
+def _camera_on_path(T_world_i: np.ndarray) -> list[list[float]] | None:
+    """Most trajectories are flat: look down on them at an angle."""
+    if T_world_i.shape[1] == 3:
+        return None
+    axes, _ = principal_axes(T_world_i[:, :3, 3])
+    return (tilt(35.0, 0.0) @ axes[[1, 2, 0]]).tolist()
 
 
 def _title(names: list[str], pair: bool) -> str:

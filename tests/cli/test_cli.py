@@ -15,7 +15,7 @@ import pytest
 import jaxreg
 from jaxreg import Status
 from jaxreg.cli.main import main
-from jaxreg.io import read_points, read_tum
+from jaxreg.io import MissingExtraError, read_points, read_tum
 
 
 RNG = np.random.default_rng(0)
@@ -390,6 +390,22 @@ def test_quiet_prints_nothing(
     assert main(["multiview", *scans, "--quiet"]) == 0
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == ("", "")
+
+
+def test_without_plotly_the_other_files_are_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def missing() -> str:
+        raise MissingExtraError("plotly", "The page report.html")
+
+    scans = _save_scans(folder)
+    _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    monkeypatch.setattr("jaxreg.plot.report_page._plotly", missing)
+    assert main(["multiview", *scans]) == 0
+    assert sorted(os.listdir("jaxreg-out")) == [f for f in FILES if f != "report.html"]
+    said = capsys.readouterr().out
+    assert "needs the package plotly" in said
+    assert "report.html" not in said.split("Written to")[1]
 
 
 def test_python_m_jaxreg_is_the_command(tmp_path: Path):

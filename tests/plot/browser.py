@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -46,7 +47,7 @@ class Page:
         self.requests: list[str] = []
 
     def open(
-        self, path: Path, width: int = 1280, height: int = 800, dark: bool = False
+        self, path: Path, width: int = 1000, height: int = 640, dark: bool = False
     ) -> None:
         """Opens a page from disk and waits until its programs say that it is ready."""
         if self._session is None:
@@ -97,7 +98,7 @@ class Page:
     def settle(self) -> None:
         """Waits for a few drawn frames."""
         frame = "new Promise(done => requestAnimationFrame(done))"
-        self.run(f"(async () => {{ for (let k = 0; k < 4; k++) await {frame}; }})()")
+        self.run(f"(async () => {{ for (let k = 0; k < 3; k++) await {frame}; }})()")
 
     def picture(self, path: Path, whole: bool = False) -> None:
         """Saves a PNG of what is seen, or of the whole page."""
@@ -159,9 +160,13 @@ def browser(folder: Path) -> Iterator[Page]:
     command_read, command_write = os.pipe()
     answer_read, answer_write = os.pipe()
     # Chromium reads its orders from descriptor 3 and answers on descriptor 4.
-    shell = f'exec 3<&{command_read} 4>&{answer_write}; exec "$0" "$@"'
+    start = (
+        f"import os, sys; os.dup2({command_read}, 3); os.dup2({answer_write}, 4);"
+        "os.execv(sys.argv[1], sys.argv[1:])"
+    )
+    command = [sys.executable, "-I", "-S", "-c", start, found]
     process = subprocess.Popen(
-        ["sh", "-c", shell, found, *_FLAGS, f"--user-data-dir={folder}"],
+        [*command, *_FLAGS, f"--user-data-dir={folder}"],
         pass_fds=(command_read, answer_write),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

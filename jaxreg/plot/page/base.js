@@ -17,6 +17,7 @@ const state = {
   mode: 0,
   axis: 0,
   cut: 0.5,
+  edge: null, // an edge of a graph that is drawn thick
 };
 const listeners = [];
 
@@ -54,7 +55,7 @@ function number(x, digits = 4) {
   if (x === 0) return "0";
   const size = Math.abs(x);
   if (size >= 1e6 || size < 1e-4) return x.toExponential(digits - 1).replace("e+", "e");
-  return String(Number(x.toPrecision(size >= 1 ? Math.max(digits, 6) : digits)));
+  return String(Number(x.toPrecision(Math.max(digits, Math.ceil(Math.log10(size))))));
 }
 
 function degrees(x) { return x === null || x === undefined ? null : (x * 180) / Math.PI; }

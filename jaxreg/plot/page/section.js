@@ -30,6 +30,33 @@ function visibleAfter(i) {
   return DATA.scans[i].placed && (state.only ? state.only.includes(i) : state.shown[i]);
 }
 
+// Where half of the points lie on either side.
+function middleCut(axis) {
+  const { parts, box } = arranged("after");
+  const [low, high] = box[axis];
+  const values = parts.flatMap((p) => (p ? Array.from(p[axis].filter((_, k) => k % 7 === 0)) : []));
+  values.sort((x, y) => x - y);
+  const share = (values[values.length >> 1] - low) / Math.max(high - low, 1e-30);
+  return Math.min(Math.max(share, 0), 1);
+}
+
+// How long an outline a cut through the middle shows, in squares of a grid.
+function outlineLength(axis) {
+  const { parts, box } = arranged("after");
+  [state.axis, state.cut] = [axis, middleCut(axis)];
+  const { at, width } = cutRange();
+  const cell = Math.max(...box.map(([low, high]) => high - low), 1e-12) / 60;
+  const [u, v] = [0, 1, 2].filter((a) => a !== axis);
+  const squares = new Set();
+  for (const p of parts) {
+    for (let k = 0; p && k < p[0].length; k++) {
+      if (Math.abs(p[axis][k] - at) > width / 2) continue;
+      squares.add(`${Math.floor(p[u][k] / cell)},${Math.floor(p[v][k] / cell)}`);
+    }
+  }
+  return squares.size;
+}
+
 function slabTraces() {
   const { parts } = arranged("after");
   const { at, width } = cutRange();
@@ -98,9 +125,10 @@ function drawSlab() {
 function startSection() {
   $("section-card").hidden = false;
   ORDER = shuffled();
-  // Across the axis that the viewer looks along.
-  const toward = DATA.camera[2].map(Math.abs);
-  state.axis = toward.indexOf(Math.max(...toward));
+  const lengths = AXES.map((_, a) => outlineLength(a));
+  state.axis = lengths.indexOf(Math.max(...lengths));
+  state.cut = middleCut(state.axis);
+  $("cut").value = 1000 * state.cut;
   choice("axis", AXES.map((name, a) => [a, name]), "axis");
   // The outline in the 3D view follows when the slider rests: it redraws all points.
   let rest = 0;

@@ -42,7 +42,7 @@ function posesTable() {
   const body = rows.map((s) => {
     const name = el("span", {}, ...(s.color
       ? [el("span", { class: "dot", style: `background:${rgb(s.color)}` })] : []), s.name);
-    const t = names.map((_, a) => (s.placed ? number(s.T[a][DATA.dim], 5) : "–"));
+    const t = names.map((_, a) => (s.placed ? number(s.T[a][DATA.dim], 6) : "–"));
     const r = s.placed ? turnOf(s.T).map((x) => x.toFixed(3)) : turns.map(() => "–");
     const status = s.placed ? s.status : `${s.status}, not placed`;
     return { title: s.name, cells: [name, ...(withStatus ? [status] : []), ...t, ...r,
@@ -55,8 +55,9 @@ function posesTable() {
   }
   const more = SCANS || DATA.num_poses <= rows.length ? ""
     : ` The first ${rows.length} of ${DATA.num_poses}; poses.tum holds all.`;
+  const sigma = withSigma ? " σ assumes independent errors of the points." : "";
   $("poses-note").textContent = "From each frame to the common one: translation in the " +
-    `unit of the input, rotation ${FLAT ? "angle" : "vector"} in degrees.${more}`;
+    `unit of the input, rotation ${FLAT ? "angle" : "vector"} in degrees.${sigma}${more}`;
   $("poses").append(table(heads, body));
 }
 
@@ -117,6 +118,7 @@ details();
 (SCANS ? startScans() : startGraph()).then(() => {
   if (SCANS && !FLAT) startSection();
   if (SCANS && DATA.pairs.length && DATA.scans.length > 2) startPairs();
+  else $("section-card").classList.add("full");
   // Colours of the drawings follow when the system turns dark or light.
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => change({}));
   document.body.dataset.ready = "yes";

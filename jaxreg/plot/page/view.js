@@ -116,7 +116,7 @@ function markerSize() {
   const box = $("scene").getBoundingClientRect();
   const counts = POINTS.map((p) => p.n).sort((a, b) => a - b);
   const size = 1.2 * Math.sqrt((0.13 * box.width * box.height) / (counts[counts.length >> 1] + 1));
-  return Math.min(Math.max(size, 1.8), FLAT ? 7 : 4.5);
+  return Math.min(Math.max(size, 1.8), FLAT ? 9 : 4.5);
 }
 
 function sceneTraces() {
@@ -163,9 +163,8 @@ function reach({ parts, box }, direction, longest) {
 }
 
 // The camera of plotly: lengths in the longest side of the box, 45 degrees high.
-function cameraHome() {
+function cameraOn(view) {
   const [right, up, toward] = DATA.camera;
-  const view = arranged("after");
   const longest = Math.max(...view.box.map(([low, high]) => high - low), 1e-12);
   const { width, height } = $("scene").getBoundingClientRect();
   const half = Math.max(reach(view, up, longest), (reach(view, right, longest) * height) / width);
@@ -174,13 +173,12 @@ function cameraHome() {
   return { eye: at(toward, away), up: at(up, 1), center: { x: 0, y: 0, z: 0 } };
 }
 
-function sceneLayout() {
-  const { box } = arranged(state.when);
+// The layout of the main view; `seen` is what the camera starts on.
+function sceneLayout({ box } = arranged(state.when), seen = null) {
   const base = {
     margin: { l: 0, r: 0, t: 0, b: 0 },
     paper_bgcolor: "rgba(0,0,0,0)",
     plot_bgcolor: "rgba(0,0,0,0)",
-    font: { color: theme("--soft") },
     uirevision: "keep",
   };
   if (FLAT) {
@@ -202,7 +200,7 @@ function sceneLayout() {
     scene: {
       xaxis: axis(0), yaxis: axis(1), zaxis: axis(2),
       aspectmode: "manual", aspectratio: { x: ratio[0], y: ratio[1], z: ratio[2] },
-      camera: cameraHome(), dragmode: "orbit", uirevision: "keep",
+      camera: cameraOn(seen || arranged("after")), dragmode: "orbit", uirevision: "keep",
       bgcolor: "rgba(0,0,0,0)",
     },
   };
@@ -223,7 +221,7 @@ function resetView() {
   if (FLAT) {
     const { xaxis, yaxis } = sceneLayout();
     Plotly.relayout("scene", { "xaxis.range": xaxis.range, "yaxis.range": yaxis.range });
-  } else Plotly.relayout("scene", { "scene.camera": cameraHome() });
+  } else Plotly.relayout("scene", { "scene.camera": cameraOn(arranged("after")) });
 }
 
 function showScale() {
