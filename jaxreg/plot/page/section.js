@@ -12,6 +12,12 @@ function cutRange() {
   return { low, high, width, at: low + state.cut * (high - low) };
 }
 
+// The other two axes: to the right, and upwards the one that points up in the 3D view.
+function slabAxes() {
+  const up = DATA.camera[1].map(Math.abs);
+  return [0, 1, 2].filter((a) => a !== state.axis).sort((a, b) => up[a] - up[b]);
+}
+
 function shuffled() {
   const order = [];
   POINTS.forEach((p, i) => { for (let k = 0; k < p.n; k++) order.push(i, k); });
@@ -60,7 +66,7 @@ function outlineLength(axis) {
 function slabTraces() {
   const { parts } = arranged("after");
   const { at, width } = cutRange();
-  const [u, v] = [0, 1, 2].filter((a) => a !== state.axis);
+  const [u, v] = slabAxes();
   const shown = DATA.scans.map((_, i) => visibleAfter(i));
   const [x, y, color] = [[], [], []];
   for (let m = 0; m < ORDER.length; m += 2) {
@@ -76,7 +82,7 @@ function slabTraces() {
 
 function slabLayout() {
   const { box } = arranged("after");
-  const [u, v] = [0, 1, 2].filter((a) => a !== state.axis);
+  const [u, v] = slabAxes();
   const axis = (a) => {
     const grow = 0.04 * (box[a][1] - box[a][0]) + 1e-12;
     return { range: [box[a][0] - grow, box[a][1] + grow], showgrid: false, zeroline: false,
@@ -94,7 +100,7 @@ function slabLayout() {
 function cutOutline() {
   const { box } = arranged("after");
   const { at } = cutRange();
-  const [u, v] = [0, 1, 2].filter((a) => a !== state.axis);
+  const [u, v] = slabAxes();
   const corners = [[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]].map(([p, q]) => {
     const c = [0, 0, 0];
     c[state.axis] = at;
