@@ -28,7 +28,7 @@ from jaxreg.particle import (
 from jaxreg.plot.figure import figure_module
 
 
-HORSE_BUDGETS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1)
+HORSE_BUDGETS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
 SCAN_BUDGETS = (1 / 8, 1 / 4, 1 / 2, 1)
 LEAST_OVERLAP = 0.1
 # Colours that people who confuse red and green tell apart.

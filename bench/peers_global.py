@@ -107,6 +107,7 @@ class Features(NamedTuple):
     def prepare(self, points: np.ndarray) -> tuple[Any, Any]:
         """Thinned cloud with normals, and features."""
         lib: Any = importlib.import_module("open3d")
+        lib.utility.set_verbosity_level(lib.utility.VerbosityLevel.Error)
         reg, near = (
             lib.pipelines.registration,
             lib.geometry.KDTreeSearchParamHybrid,
