@@ -22,7 +22,13 @@ from jaxreg._core.threads import map_in_threads, num_cores
 from jaxreg._core.typing import Key
 from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.geometry import lie
-from jaxreg.local import AbstractRegistrar, Curvature, Modes, RegistrationSolution
+from jaxreg.local import (
+    AbstractRegistrar,
+    Curvature,
+    Modes,
+    RegistrationSolution,
+    tangent_unit,
+)
 from jaxreg.particle import ParticleFilter
 
 
@@ -201,6 +207,8 @@ def _register_pair(
     curvature = Curvature(
         solution.H, solution.b, solution.error, solution.covariance
     ).scaled(radius)
+    modes = solution.modes
+    unit = tangent_unit(radius, modes.covariance.shape[-1])
     return RegistrationSolution(
         T_target_source=back(solution.T_target_source),
         status=status.astype(jnp.int32),
@@ -214,9 +222,10 @@ def _register_pair(
         error=curvature.error,
         covariance=curvature.covariance,
         modes=Modes(
-            jax.vmap(back)(solution.modes.T_target_source),
-            solution.modes.weight,
-            solution.modes.fitness,
+            jax.vmap(back)(modes.T_target_source),
+            modes.weight,
+            modes.fitness,
+            modes.covariance * jnp.outer(unit, unit),
         ),
     )
 

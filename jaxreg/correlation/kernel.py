@@ -145,6 +145,7 @@ class KernelCorrelation(AbstractRegistrar):
         num_pairs = jnp.sum(source.mask, dtype=dtype) * jnp.sum(
             target.mask, dtype=dtype
         )
+        covariance = _covariance(held, end.T_target_source, *fixed[:2], fixed[3])
         return RegistrationSolution(
             T_target_source=T,
             status=status.astype(jnp.int32),
@@ -156,8 +157,8 @@ class KernelCorrelation(AbstractRegistrar):
             H=held.H,
             b=held.b,
             error=fixed[3] ** 2 * (num_pairs - held.correlation),
-            covariance=_covariance(held, end.T_target_source, *fixed[:2], fixed[3]),
-            modes=Modes(T[None], jnp.ones(1, dtype), there.fitness[None]),
+            covariance=covariance,
+            modes=Modes.alone(T, there.fitness, covariance),
         )
 
     def width(self, spacing: Float[Array, ""]) -> Float[Array, ""]:

@@ -5,6 +5,7 @@ from jaxreg.local.base import Modes as Modes
 from jaxreg.local.base import RegistrationSolution as RegistrationSolution
 from jaxreg.local.curvature import Curvature as Curvature
 from jaxreg.local.curvature import sandwich as sandwich
+from jaxreg.local.curvature import tangent_unit as tangent_unit
 from jaxreg.local.icp import ICP as ICP
 from jaxreg.local.optimiser import LocalOptimiser as LocalOptimiser
 from jaxreg.local.problem import Match as Match

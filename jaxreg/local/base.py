@@ -4,6 +4,7 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -19,11 +20,35 @@ class Modes(eqx.Module):
         T_target_source: `(q, d+1, d+1)`.
         weight: `(q,)` share of the posterior; zero marks an unused row.
         fitness: `(q,)` as in the solution.
+        covariance: `(q, k, k)` of each, as in the solution.
     """
 
     T_target_source: Float[Array, "*b q D D"]
     weight: Float[Array, "*b q"]
     fitness: Float[Array, "*b q"]
+    covariance: Float[Array, "*b q k k"]
+
+    @classmethod
+    def alone(
+        cls,
+        T_target_source: Motion,
+        fitness: Float[Array, ""],
+        covariance: Float[Array, "k k"],
+    ) -> "Modes":
+        """One pose with all the weight."""
+        one = jnp.ones(1, fitness.dtype)
+        return cls(T_target_source[None], one, fitness[None], covariance[None])
+
+    @property
+    def margin(self) -> Float[Array, "*b"]:
+        """Weight of the first less that of the best other: one where it is alone."""
+        others = jnp.max(self.weight[..., 1:], axis=-1, initial=0)
+        return self.weight[..., 0] - others
+
+    @property
+    def effective_size(self) -> Float[Array, "*b"]:
+        """(sum w)^2 / sum w^2: how many modes share the posterior."""
+        return jnp.sum(self.weight, -1) ** 2 / jnp.sum(self.weight**2, -1)
 
 
 class RegistrationSolution(eqx.Module):

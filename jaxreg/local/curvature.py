@@ -49,8 +49,7 @@ class Curvature(eqx.Module):
 
     def scaled(self, length: Float[Array, ""]) -> "Curvature":
         """In a unit of length that is 1 / `length` times the present one."""
-        d = 2 if self.b.shape[0] == 3 else 3
-        unit = jnp.where(jnp.arange(self.b.shape[0]) < d, length, 1)
+        unit = tangent_unit(length, self.b.shape[0])
         sq = length * length
         return Curvature(
             H=self.H * sq / jnp.outer(unit, unit),
@@ -58,6 +57,11 @@ class Curvature(eqx.Module):
             error=self.error * sq,
             covariance=self.covariance * jnp.outer(unit, unit),
         )
+
+
+def tangent_unit(length: Float[Array, ""], k: int) -> Float[Array, " k"]:
+    """`length` for the translation, one for the rotation, of k numbers."""
+    return jnp.where(jnp.arange(k) < (2 if k == 3 else 3), length, 1)
 
 
 def sandwich(H: Float[Array, "k k"], meat: Float[Array, "k k"]) -> Float[Array, "k k"]:

@@ -152,7 +152,7 @@ class ICP(AbstractRegistrar):
             b=curvature.b,
             error=curvature.error,
             covariance=curvature.covariance,
-            modes=Modes(T[None], jnp.ones(1, dtype), there.fitness[None]),
+            modes=Modes.alone(T, there.fitness, curvature.covariance),
         )
 
     @property

@@ -1,6 +1,7 @@
 """From many measured poses to an answer: modes, refinement, scores, status."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -18,11 +19,12 @@ from jaxreg.local import (
     PointToPlane,
     Problem,
     RegistrationSolution,
+    Score,
     match,
     score_both_ways,
 )
 from jaxreg.neighbours import AbstractIndex
-from jaxreg.particle.modes import distinct_modes
+from jaxreg.particle.modes import distinct_modes, first_within
 from jaxreg.particle.state import Particles
 from jaxreg.robust import AbstractKernel
 
@@ -95,34 +97,52 @@ def conclude(
     eye = lie.identity(T_modes.shape[-1] - 1, dtype)
     T_modes = jnp.where(sound[:, None, None], T_modes, eye)
 
-    there, back = lax.map(
-        lambda T: score_both_ways(
-            pair.source, pair.target, pair.source_index, pair.target_index, T, spacing
-        ),
-        T_modes,
-    )
-    overlap = jnp.where(sound, jnp.minimum(there.fitness, back.fitness), -1)
+    scores = lax.map(lambda T: _Mode.of(pair, T, optimiser, spacing), T_modes)
+    overlap = jnp.where(sound, scores.overlap, -1)
     order = jnp.argsort(-overlap) if refine_steps else jnp.arange(num_modes)
-    best = order[0]
-    T = T_modes[best]
-    status = _status(overlap[order], pair, min_overlap, finished | (refine_steps > 0))
-    found = match(pair.problem, T)
-    weight = optimiser.weights(found, 0.5 * spacing)
-    curvature = Curvature.of(optimiser.residual, found, weight)
-    return RegistrationSolution(
-        T_target_source=T,
-        status=status,
-        fitness=there.fitness[best],
-        inlier_rmse=there.inlier_rmse[best],
-        num_inliers=there.num_inliers[best],
-        overlap=jnp.maximum(overlap[best], 0),
-        num_steps=(num_steps + refine_steps).astype(jnp.int32),
-        H=curvature.H,
-        b=curvature.b,
-        error=curvature.error,
-        covariance=curvature.covariance,
-        modes=Modes(T_modes[order], mass[order], there.fitness[order]),
+    T_modes, mass, overlap, scores = jax.tree.map(
+        lambda x: x[order], (T_modes, mass, overlap, scores)
     )
+    # Refinement may lead two of them to one pose.
+    first = first_within(T_modes, angle=limit, distance=limit)
+    mass = jax.ops.segment_sum(mass, first, num_modes)
+    overlap = jnp.where(first == jnp.arange(num_modes), overlap, -1)
+    best = jax.tree.map(lambda x: x[0], scores)
+    status = _status(overlap, pair, min_overlap, finished | (refine_steps > 0))
+    return RegistrationSolution(
+        T_target_source=T_modes[0],
+        status=status,
+        fitness=best.there.fitness,
+        inlier_rmse=best.there.inlier_rmse,
+        num_inliers=best.there.num_inliers,
+        overlap=jnp.maximum(overlap[0], 0),
+        num_steps=(num_steps + refine_steps).astype(jnp.int32),
+        H=best.curvature.H,
+        b=best.curvature.b,
+        error=best.curvature.error,
+        covariance=best.curvature.covariance,
+        modes=Modes(T_modes, mass, scores.there.fitness, scores.curvature.covariance),
+    )
+
+
+class _Mode(eqx.Module):
+    """What is known of a pose: its scores and the curvature of the energy."""
+
+    there: Score
+    overlap: Float[Array, "*q"]
+    curvature: Curvature
+
+    @classmethod
+    def of(
+        cls, pair: Pair, T: Motion, optimiser: LocalOptimiser, spacing: Scalar
+    ) -> "_Mode":
+        there, back = score_both_ways(
+            pair.source, pair.target, pair.source_index, pair.target_index, T, spacing
+        )
+        found = match(pair.problem, T)
+        weight = optimiser.weights(found, 0.5 * spacing)
+        curvature = Curvature.of(optimiser.residual, found, weight)
+        return cls(there, jnp.minimum(there.fitness, back.fitness), curvature)
 
 
 def _refine(
@@ -147,7 +167,7 @@ def _status(
     min_overlap: Array | float,
     finished: Bool[Array, ""],
 ) -> Int[Array, ""]:
-    """Of modes with the answer first; an overlap of -1 marks one that is no pose."""
+    """Of modes with the answer first; an overlap of -1 marks one that is none."""
     status = jnp.where(finished, Status.CONVERGED, Status.MAX_STEPS)
     if overlap.shape[0] > 1:
         rival = jnp.max(overlap[1:]) > _RIVAL * overlap[0]

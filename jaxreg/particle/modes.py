@@ -35,3 +35,15 @@ def distinct_modes(
     free = jnp.isfinite(particles.energy) & (particles.log_weight > -jnp.inf)
     _, (rows, mass) = lax.scan(pick, free, None, length=num_modes)
     return jnp.where(mass > 0, rows, rows[0]).astype(jnp.int32), mass
+
+
+def first_within(
+    T: Float[Array, "q D D"], *, angle: Scalar, distance: Scalar
+) -> Int[Array, " q"]:
+    """The first row within `angle` (radians) and `distance` of each; itself if none."""
+    R, t = lie.rotation(T), lie.translation(T)
+    turn = lie.rotation_angle(jnp.einsum("pij,qkj->pqik", R, R))
+    shift = jnp.sqrt(jnp.sum((t[:, None] - t) ** 2, axis=-1))
+    # Of NaN nothing is within reach, not even itself.
+    near = (turn < angle) & (shift < distance) | jnp.eye(len(T), dtype=bool)
+    return jnp.argmax(near, axis=1).astype(jnp.int32)

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.linalg import expm
@@ -24,6 +24,9 @@ tangents_6 = hnp.arrays(np.float64, 6, elements=st.floats(-1.5, 1.5))
 
 @settings(max_examples=30, deadline=None)
 @given(v=st.one_of(tangents_3, tangents_6))
+@example(v=np.array([1, 0.3, 1e-8]))
+@example(v=np.array([1, 0.3, 0.2, 1e-6, 0, 1e-6]))
+@example(v=np.array([1, 0.3, 0.2, 0.03, 0, 0.001]))
 def test_exp_is_the_matrix_exponential_translation_first(v):
     with jax.enable_x64(True):
         T = lie.exp(jnp.asarray(v))

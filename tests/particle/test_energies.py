@@ -50,10 +50,12 @@ def test_energies_are_their_equations(kind):
     moved = POINTS.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     distance, row = KDTree(POINTS.astype(np.float64)).query(moved)
     cosine = np.sum((NORMALS @ T[:3, :3].T) * NORMALS[row], 1)
+    height = np.sum(NORMALS[row] * (POINTS[row] - moved), 1)
+    along = distance**2 - height**2
     energy, value = {
         "bounded": (
-            BoundedEnergy(),
-            1 - cosine**2 / (1 + distance**2 / WIDTH**2),
+            BoundedEnergy(slide=0.2, narrow=0.6),
+            1 - cosine**2 / (1 + (height**2 + 0.04 * along) / (0.6 * WIDTH) ** 2),
         ),
         "squared": (SquaredEnergy(), distance**2),
         "absolute": (AbsoluteEnergy(0.05), np.sqrt(distance**2 + 0.05**2)),

@@ -3,24 +3,41 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
+from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Scalar
 from jaxreg.local import Match
 from jaxreg.particle.energies.base import AbstractEnergy
 
 
 class BoundedEnergy(AbstractEnergy):
-    """1 - mean of agreement / (1 + r^2 / width^2), in [0, 1].
+    """1 - mean of agreement / (1 + (h^2 + (slide a)^2) / (narrow width)^2), in [0, 1].
 
-    Bounded, as partial overlap needs it: points of the source without a counterpart
-    cost one, however far away they are. Agreement is the squared cosine between the
-    normals, one where there are none.
+    h is the height over the target's tangent plane (line in 2D), a the distance along
+    it. Between samples of the same surface a is as large as their spacing, which says
+    nothing of the pose; so it counts little. Bounded, as partial overlap needs it:
+    points of the source without a counterpart cost one, however far away they are.
+    Agreement is the squared cosine between the normals, one where there are none; then
+    h is the whole distance.
+
+    Attributes:
+        slide: how much a distance along the surface counts.
+        narrow: width of the energy in that of the optimiser, which has to reach
+            farther than what is to be told apart.
     """
 
     resolution: ClassVar[float] = 4.0
+    slide: Array | float = traced(0.3)
+    narrow: Array | float = traced(0.5)
 
     def __call__(self, found: Match, width: Scalar) -> Scalar:
         """The share of the source that has no counterpart, softly."""
-        support = found.agreement / (1 + found.sq_residual / width**2)
+        sq = found.sq_residual
+        flat = jnp.any(found.normal != 0, axis=0)
+        height_sq = jnp.where(flat, found.plane_residual**2, sq)
+        slide, narrow = (jnp.asarray(x, sq.dtype) for x in (self.slide, self.narrow))
+        sq = height_sq + slide**2 * jnp.maximum(sq - height_sq, 0)
+        support = found.agreement / (1 + sq / (narrow * width) ** 2)
         total = jnp.maximum(jnp.sum(found.mask), 1).astype(support.dtype)
         return 1 - jnp.sum(support) / total
