@@ -94,14 +94,14 @@ class ParticleFilter(AbstractSearch):
     Gradients: none; refine with `ICP` from the answer to differentiate it.
     """
 
-    num_prior: int = eqx.field(default=2048, static=True)
-    num_particles: int = eqx.field(default=128, static=True)
-    num_times: int = eqx.field(default=8, static=True)
-    prior_steps: int = eqx.field(default=4, static=True)
+    num_prior: int = eqx.field(default=1024, static=True)
+    num_particles: int = eqx.field(default=256, static=True)
+    num_times: int = eqx.field(default=7, static=True)
+    prior_steps: int = eqx.field(default=6, static=True)
     inner_steps: int = eqx.field(default=3, static=True)
     refine_steps: int = eqx.field(default=24, static=True)
     num_points: int = eqx.field(default=400, static=True)
-    num_modes: int = eqx.field(default=4, static=True)
+    num_modes: int = eqx.field(default=8, static=True)
     max_points: int = eqx.field(default=4096, static=True)
     batch_size: int = eqx.field(default=32, static=True)
     prior: AbstractPrior | None = None
@@ -111,7 +111,7 @@ class ParticleFilter(AbstractSearch):
     residual: AbstractResidual = eqx.field(default_factory=lambda: PointToPlane(0.2))
     kernel: AbstractKernel = eqx.field(default_factory=GemanMcClure)
     step: AbstractStep = eqx.field(default_factory=GaussNewton)
-    sample_share: Array | float = traced(0.5)
+    sample_share: Array | float = traced(0.98)
     prior_error_share: Array | float = traced(0.25)
     width_start: Array | float = traced(0.3)
     width_end: Array | float = traced(0.06)
