@@ -69,6 +69,31 @@ def check_mask(mask: object, shape: tuple[int, ...], name: str) -> Array:
     return out
 
 
+def check_pair(
+    source: object, target: object, source_mask: object, target_mask: object
+) -> tuple[Array, Array, Array, Array]:
+    """Point sets of one dtype, dimension and leading axes, and masks of their rows."""
+    source, target = as_float_array(source, "source"), as_float_array(target, "target")
+    d = check_points(source, "source")
+    if check_points(target, "target") != d:
+        raise ValueError(
+            f"target: wanted points of dimension {d} like source, found shape "
+            f"{target.shape}."
+        )
+    if target.dtype != source.dtype:
+        raise TypeError(
+            f"target: wanted dtype {source.dtype} like source, found {target.dtype}."
+        )
+    if target.shape[:-2] != source.shape[:-2]:
+        raise ValueError(
+            f"target: wanted leading axes {source.shape[:-2]} like source, found "
+            f"{target.shape[:-2]}."
+        )
+    source_mask = check_mask(source_mask, source.shape[:-1], "source_mask")
+    target_mask = check_mask(target_mask, target.shape[:-1], "target_mask")
+    return source, target, source_mask, target_mask
+
+
 def check_motion(T: Array, d: int, name: str) -> None:
     """Requires homogeneous matrices `(..., d+1, d+1)`."""
     if T.ndim < 2 or T.shape[-2:] != (d + 1, d + 1):

@@ -2,7 +2,7 @@
 
 Coordinates of the source are held as rows `(d, n)`, which XLA vectorises over points.
 The source is centred at its own centroid, so that rotation and translation decouple
-(PF paper, section 3.1); see `registration.py` for the frames around it.
+(PF paper, section 3.1); see `jaxreg.registration.pair` for the frames around it.
 """
 
 import equinox as eqx

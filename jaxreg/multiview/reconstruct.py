@@ -22,6 +22,7 @@ from jaxreg._core.checks import (
     check_points,
     is_concrete,
 )
+from jaxreg._core.padding import rounded_up, stacked
 from jaxreg._core.status import Status
 from jaxreg._core.threads import map_in_threads
 from jaxreg._core.typing import Key, Progress, StatusArray
@@ -37,8 +38,6 @@ from jaxreg.particle import ParticleFilter
 
 _PAIRS_PER_BATCH = 4
 _THREADS = 2
-# Padded scans come in multiples of this many rows, so that few sizes compile.
-_ROWS = 4096
 
 
 class ReconstructionSolution(eqx.Module):
@@ -165,10 +164,10 @@ def _padded(scans: object, mask: object) -> tuple[Array, Array]:
         if len(arrays) < 2:
             raise ValueError(f"scans: wanted two or more, found {len(arrays)}.")
         dtype = jnp.result_type(*arrays)
-        rows = -(-max(len(x) for x in arrays) // _ROWS) * _ROWS
-        padded = [jnp.pad(x, ((0, rows - len(x)), (0, 0))) for x in arrays]
-        lengths = jnp.asarray([len(x) for x in arrays])
-        return jnp.stack(padded).astype(dtype), jnp.arange(rows) < lengths[:, None]
+        lengths = np.array([len(x) for x in arrays])
+        rows = rounded_up(max(lengths.tolist()))
+        row_mask = jnp.asarray(np.arange(rows) < lengths[:, None])
+        return stacked([x.astype(dtype) for x in arrays], rows), row_mask
     points = as_float_array(scans, "scans")
     check_points(points, "scans")
     if points.ndim != 3 or points.shape[0] < 2:

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxreg._core.checks import as_float_array, check_mask, check_motion, check_points
+from jaxreg._core.checks import as_float_array, check_motion, check_pair
 from jaxreg.geometry import lie
 from jaxreg.neighbours.auto import exact_index
 from jaxreg.neighbours.base import Neighbours
@@ -42,24 +42,17 @@ def correspondences(
 
     Gradients: of `sq_distance`, with respect to both clouds and the pose.
     """
-    source = as_float_array(source, "source")
-    target = as_float_array(target, "target")
-    d = check_points(source, "source")
-    if source.ndim != 2 or target.ndim != 2 or check_points(target, "target") != d:
+    source, target, source_mask, target_mask = check_pair(
+        source, target, source_mask, target_mask
+    )
+    if source.ndim != 2:
         raise ValueError(
-            "target: wanted one pair of point sets (n, d) and (m, d), found shapes "
-            f"{source.shape} and {target.shape}."
-        )
-    if target.dtype != source.dtype:
-        raise TypeError(
-            f"target: wanted dtype {source.dtype} like source, found {target.dtype}."
+            f"source: wanted one point set (n, d), found shape {source.shape}."
         )
     T = as_float_array(T_target_source, "T_target_source").astype(source.dtype)
     if T.ndim != 2:
         raise ValueError(f"T_target_source: wanted one motion, found shape {T.shape}.")
-    check_motion(T, d, "T_target_source")
-    source_mask = check_mask(source_mask, source.shape[:-1], "source_mask")
-    target_mask = check_mask(target_mask, target.shape[:-1], "target_mask")
+    check_motion(T, source.shape[-1], "T_target_source")
     if max_distance is not None:  # an array: another distance compiles nothing
         max_distance = jnp.asarray(max_distance, source.dtype)
     return _find(source, target, T, max_distance, source_mask, target_mask)

@@ -32,7 +32,8 @@ def test_pairs_are_the_closest_at_the_pose(pair):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (lambda s, t, T: (s[:, :2], t, T), r"target: wanted one pair"),
+        (lambda s, t, T: (s[:, :2], t, T), r"target: .* dimension 2"),
+        (lambda s, t, T: (s[None], t[None], T), r"source: wanted one point set"),
         (lambda s, t, T: (s, t, T[:3, :3]), r"T_target_source: .* found \(3, 3\)"),
         (lambda s, t, T: (s, t, T[None]), r"T_target_source: wanted one motion"),
     ],

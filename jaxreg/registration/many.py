@@ -1,0 +1,175 @@
+"""Many pairs: in groups of one size, in chunks over the cores of a CPU."""
+
+import math
+from collections.abc import Callable, Hashable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from jaxreg._core.checks import (
+    is_concrete,
+)
+from jaxreg._core.padding import (
+    rounded_up,
+    stacked,
+)
+from jaxreg._core.threads import map_in_threads, num_cores
+from jaxreg.local import (
+    AbstractRegistrar,
+    RegistrationSolution,
+)
+from jaxreg.registration.pair import register_pair
+
+
+# Pairs in one call of a compiled program: less than a few are slowed by calling it.
+_CHUNK = 8
+# Rows of padding that cost as much time as compiling another program, some seconds.
+_MOST_PADDING = 1 << 24
+
+# Sources, targets, masks of both, initial poses, and the data of keys.
+_Pairs = tuple[Array, Array, Array, Array, Array | None, Array | None]
+_Tree = TypeVar("_Tree")
+# Pairs of one size: their numbers, and some of them as arrays with a leading axis.
+_Group = tuple[np.ndarray, Callable[[np.ndarray], _Pairs]]
+
+
+def register_batch(
+    method: AbstractRegistrar,
+    batch: tuple[int, ...],
+    pair: tuple[Array, ...],
+    init: Array | None,
+    key: Array | None,
+) -> RegistrationSolution:
+    """Of pairs of one size."""
+    num = math.prod(batch)
+    data, impl = _split(key, num)
+
+    def flat(x: Array) -> Array:
+        return x.reshape(num, *x.shape[len(batch) :])
+
+    every = (*map(flat, pair), None if init is None else flat(init), data)
+    threads = num > 0 and _in_threads(method, every)
+    every = _on_host(every) if threads else every
+
+    def of_rows(rows: np.ndarray) -> _Pairs:
+        if len(rows) == num:
+            return jax.tree.map(jnp.asarray, every)
+        return jax.tree.map(lambda x: jnp.asarray(x[rows]), every)
+
+    group = np.arange(num), of_rows
+    solution = _register_groups(method, [group], impl, threads)
+    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solution)
+
+
+def register_lists(
+    method: AbstractRegistrar,
+    lists: tuple[list[Array], ...],
+    init: Array | None,
+    key: Array | None,
+) -> RegistrationSolution:
+    """Of pairs of unequal sizes, padded."""
+    sources, targets, source_masks, target_masks = lists
+    data, impl = _split(key, len(sources))
+    threads = _in_threads(method, (lists, init, data))
+    each = _on_host((init, data)) if threads else (init, data)
+
+    def group(sizes: np.ndarray, members: np.ndarray) -> _Group:
+        n, m = sizes.tolist()
+
+        def of_rows(rows: np.ndarray) -> _Pairs:
+            rows = members[rows]
+            return (
+                stacked([sources[i] for i in rows], n),
+                stacked([targets[i] for i in rows], m),
+                stacked([source_masks[i] for i in rows], n),
+                stacked([target_masks[i] for i in rows], m),
+                *jax.tree.map(lambda x: jnp.asarray(x[rows]), each),
+            )
+
+        return members, of_rows
+
+    sizes = np.array([[rounded_up(len(x)) for x in xs] for xs in (sources, targets)])
+    groups = [group(*same) for same in _of_similar_size(sizes.T)]
+    return _register_groups(method, groups, impl, threads)
+
+
+def _of_similar_size(sizes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Sizes to pad pairs to, given `(num, 2)`, and the rows of those pairs."""
+    largest = sizes.max(axis=0)
+    if np.sum(largest - sizes) <= _MOST_PADDING:
+        return [(largest, np.arange(len(sizes)))]
+    kinds, kind = np.unique(sizes, axis=0, return_inverse=True)
+    return [(size, np.flatnonzero(kind == k)) for k, size in enumerate(kinds)]
+
+
+def _split(key: Array | None, num: int) -> tuple[Array | None, Hashable]:
+    """Data of a key for each pair, and what kind of key it is of."""
+    if key is None:
+        return None, None
+    return jax.random.key_data(jax.random.split(key, num)), jax.random.key_impl(key)
+
+
+def _in_threads(*inputs: object) -> bool:
+    """Whether to use the cores of a CPU, on which XLA runs a loop on one."""
+    arrays = jax.tree.leaves(inputs)
+    return jax.default_backend() == "cpu" and all(map(is_concrete, arrays))
+
+
+def _on_host(arrays: _Tree) -> _Tree:
+    """The same memory: to take rows of it compiles nothing."""
+    return jax.tree.map(np.asarray, arrays)
+
+
+def _register_groups(
+    method: AbstractRegistrar, groups: list[_Group], impl: Hashable, threads: bool
+) -> RegistrationSolution:
+    """Group after group, the solutions in the order of the pairs' numbers."""
+    parts = []
+    for members, of_rows in groups:
+
+        def some(rows: np.ndarray, of_rows: Callable = of_rows) -> RegistrationSolution:
+            return _register_rows(method, of_rows(rows), impl)
+
+        every = np.arange(len(members))
+        parts.append(_over_cores(some, every) if threads else some(every))
+    if len(parts) == 1:
+        return jax.tree.map(jnp.asarray, parts[0])
+    order = np.argsort(np.concatenate([members for members, _ in groups]))
+    xp = np if threads else jnp
+    return jax.tree.map(lambda *x: jnp.asarray(xp.concatenate(x)[order]), *parts)
+
+
+def _over_cores(
+    register_rows: Callable[[np.ndarray], RegistrationSolution], rows: np.ndarray
+) -> RegistrationSolution:
+    """In chunks of one size, as many at a time as there are cores; NumPy arrays."""
+    num, cores = len(rows), num_cores()
+    chunk = max(min(num // (4 * cores), _CHUNK), 1)
+    chunk = 1 << (chunk.bit_length() - 1)  # another number of pairs compiles nothing
+
+    def run(start: int) -> RegistrationSolution:
+        first = min(start, num - chunk)
+        found = register_rows(rows[first : first + chunk])
+        return jax.tree.map(lambda x: np.asarray(x)[start - first :], found)
+
+    parts = map_in_threads(run, range(0, num, chunk), cores)
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+@eqx.filter_jit
+def _register_rows(
+    method: AbstractRegistrar, pairs: _Pairs, impl: Hashable
+) -> RegistrationSolution:
+    """One after another: memory stays bounded."""
+
+    def one(pair: _Pairs) -> RegistrationSolution:
+        *arrays, init, data = pair
+        key = None if data is None else jax.random.wrap_key_data(data, impl=impl)
+        return register_pair(method, tuple(arrays), init, key)
+
+    return lax.map(one, pairs)

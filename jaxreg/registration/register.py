@@ -1,0 +1,124 @@
+"""`register`: what its users call."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg._core.checks import (
+    as_float_array,
+    check_key,
+    check_motion,
+    check_pair,
+)
+from jaxreg._core.padding import (
+    check_lists,
+    is_list_of_clouds,
+)
+from jaxreg._core.typing import Key
+from jaxreg.local import (
+    AbstractRegistrar,
+    RegistrationSolution,
+)
+from jaxreg.particle import ParticleFilter
+from jaxreg.registration.many import register_batch, register_lists
+from jaxreg.registration.pair import register_pair
+
+
+def register(
+    source: object,
+    target: object,
+    method: AbstractRegistrar | None = None,
+    init: object = None,
+    key: Key | None = None,
+    *,
+    source_mask: object = None,
+    target_mask: object = None,
+) -> RegistrationSolution:
+    """Registers a source point set to a target, or many pairs of them.
+
+    Args:
+        source: `(n, d)` points, d = 2 or 3; a batch of pairs `(..., n, d)`; or a list
+            of `(n_i, d)` points of any sizes, also none. Arrays are what
+            `numpy.asarray` or DLPack takes.
+        target: `(m, d)` points, a batch with the same leading axes, or a list of the
+            same length.
+        method: `ParticleFilter()` by default, which needs no initial guess; `ICP()`
+            for a local search.
+        init: `T_target_source` to start from, `(d+1, d+1)` or one per pair, or None.
+        key: a `jax.random.key`; needed by methods that draw random numbers. Many pairs
+            get one key each by splitting.
+        source_mask: `(n,)` True for valid points, for a list a list of masks or None;
+            rows that are not finite are masked in any case.
+        target_mask: `(m,)` likewise.
+
+    Returns:
+        A `RegistrationSolution`, with leading axes for a batch and one for a list.
+
+    Raises:
+        ValueError, TypeError: while tracing, for shapes, dtypes and keys that do not
+            fit, naming the argument.
+
+    Fails:
+        With the statuses of the method; TOO_FEW_POINTS where a cloud has fewer than
+        d + 1 distinct valid points, and then the pose is the identity.
+
+    Gradients:
+        As the method says.
+
+    Compilation:
+        The clouds of a list are padded to the size that holds the largest source or
+        target (see `rounded_up` in `jaxreg._core.padding`), which changes an answer by
+        rounding only, so lists of similar sizes share a program. Where that would add
+        more than 2^24 rows, each pair of sizes compiles once.
+
+    Memory:
+        Pairs are registered one after another on each core. On a CPU, beyond the
+        inputs and one copy of them, that takes `PER_CORE` bytes a core. Under `jit`
+        and on an accelerator a list becomes one padded array.
+    """
+    method = ParticleFilter() if method is None else method
+    if not isinstance(method, AbstractRegistrar):
+        raise TypeError(
+            "method: wanted a registration method such as jaxreg.ParticleFilter() or "
+            f"jaxreg.ICP(), found {type(method).__name__}."
+        )
+    key = None if key is None else check_key(key)
+    masks = source_mask, target_mask
+    if is_list_of_clouds(source) or is_list_of_clouds(target):
+        lists = check_lists(source, target, *masks)
+        batch = (len(lists[0]),)
+        init = _check_init(init, batch, lists[0][0])
+        return register_lists(method, lists, init, key)
+    pair = check_pair(source, target, *masks)
+    batch = pair[0].shape[:-2]
+    init = _check_init(init, batch, pair[0])
+    if not batch:
+        return _register_one(method, pair, init, key)
+    return register_batch(method, batch, pair, init, key)
+
+
+def _check_init(
+    init: object, batch: tuple[int, ...], points: Array
+) -> Float[Array, "*b D D"] | None:
+    """Initial poses with the leading axes `batch`."""
+    if init is None:
+        return None
+    found, d = as_float_array(init, "init").astype(points.dtype), points.shape[-1]
+    check_motion(found, d, "init")
+    try:
+        return jnp.broadcast_to(found, (*batch, d + 1, d + 1))
+    except ValueError as err:
+        raise ValueError(
+            f"init: wanted one motion or leading axes {batch} like source, found "
+            f"shape {found.shape}."
+        ) from err
+
+
+@eqx.filter_jit
+def _register_one(
+    method: AbstractRegistrar,
+    pair: tuple[Array, ...],
+    init: Array | None,
+    key: Array | None,
+) -> RegistrationSolution:
+    return register_pair(method, pair, init, key)
