@@ -16,7 +16,7 @@ from jaxreg.local import (
     GaussNewton,
     LocalOptimiser,
     Modes,
-    PointToPlane,
+    PlaneToPlane,
     Problem,
     RegistrationSolution,
     Score,
@@ -85,8 +85,9 @@ def conclude(
     dtype = particles.energy.dtype
     limit = jnp.asarray(_APART, dtype)
     rows, mass = distinct_modes(particles, num_modes, angle=limit, distance=limit)
+    # Twice to three times as accurate as planes of the target alone.
     optimiser = cast_floats(
-        LocalOptimiser(PointToPlane(), kernel, GaussNewton()), dtype
+        LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton()), dtype
     )
     spacing = pair.spacing
     T_modes = particles.T_target_source[rows]
@@ -105,8 +106,9 @@ def conclude(
     )
     # Refinement may lead two of them to one pose.
     first = first_within(T_modes, angle=limit, distance=limit)
-    mass = jax.ops.segment_sum(mass, first, num_modes)
     overlap = jnp.where(first == jnp.arange(num_modes), overlap, -1)
+    if refine_steps:
+        mass = _weights(overlap, pair)
     best = jax.tree.map(lambda x: x[0], scores)
     status = _status(overlap, pair, min_overlap, finished | (refine_steps > 0))
     return RegistrationSolution(
@@ -143,6 +145,24 @@ class _Mode(eqx.Module):
         weight = optimiser.weights(found, 0.5 * spacing)
         curvature = Curvature.of(optimiser.residual, found, weight)
         return cls(there, jnp.minimum(there.fitness, back.fitness), curvature)
+
+
+def _weights(overlap: Float[Array, " q"], pair: Pair) -> Float[Array, " q"]:
+    """Shares of the posterior, of modes with the best first.
+
+    By how much a mode's overlap falls short of the best, in the standard error that
+    the difference of two such shares has when both are the same.
+    """
+    best = jnp.clip(overlap[0], 0.1, 0.9)
+    few = jnp.minimum(jnp.sum(pair.source.mask), jnp.sum(pair.target.mask))
+    sq_error = 2 * best * (1 - best) / jnp.maximum(few, 1).astype(best.dtype)
+    short = (overlap[0] - overlap) ** 2 / sq_error
+    weight = jnp.where(overlap >= 0, jnp.exp(-short / 2), 0)
+    # A mode in use has a weight, though it may underflow.
+    weight = jnp.where(
+        overlap >= 0, jnp.maximum(weight, jnp.finfo(short.dtype).tiny), 0
+    )
+    return weight / jnp.maximum(jnp.sum(weight), jnp.finfo(short.dtype).tiny)
 
 
 def _refine(
