@@ -1,5 +1,6 @@
 """`register` as its users call it."""
 
+import dataclasses
 import pickle
 
 import jax
@@ -10,7 +11,9 @@ from helpers import blob, motion, move, pose_error
 
 import jaxreg as jr
 from jaxreg import Status
-from jaxreg.local import AbstractRegistrar
+from jaxreg.cloud import PointCloud
+from jaxreg.local import AbstractRegistrar, Modes, RegistrationSolution
+from jaxreg.registration import many
 from jaxreg.robust import L1, L2
 
 
@@ -113,17 +116,126 @@ def test_moving_both_clouds_moves_the_answer(method, tolerance):
     np.testing.assert_allclose(moved.T_target_source, expected, atol=tolerance)
 
 
-def test_same_key_same_bits_and_a_batch_equals_its_pairs():
-    pairs = [_pair(3, s)[:2] for s in (0, 1)]
-    source, target = (np.stack(x) for x in zip(*pairs, strict=True))
-    key = jax.random.key(7)
-    first = jr.register(source, target, FILTER, key=key)
-    again = jr.register(source, target, FILTER, key=key)
+def test_same_key_same_bits():
+    source, target, _ = _pair(3, 0)
+    first, again = (
+        jr.register(source, target, FILTER, key=jax.random.key(7)) for _ in range(2)
+    )
     np.testing.assert_array_equal(first.T_target_source, again.T_target_source)
-    keys = jax.random.split(key, 2)
+
+
+class _Centroids(AbstractRegistrar):
+    """Puts centroid on centroid: compiles in no time."""
+
+    def prepare(self, points, mask):
+        return PointCloud(points, jnp.zeros_like(points), mask)
+
+    def solve(self, source, target, init, key=None):
+        zero, k = jnp.zeros((), source.points.dtype), 6
+        H = jnp.zeros((k, k), zero.dtype)
+        count = jnp.zeros((), jnp.int32)
+        T = jnp.eye(4, dtype=zero.dtype)
+        return RegistrationSolution(
+            T_target_source=T,
+            status=count,
+            fitness=zero,
+            inlier_rmse=zero,
+            num_inliers=jnp.sum(source.mask, dtype=jnp.int32),
+            overlap=zero,
+            num_steps=count,
+            H=H,
+            b=H[0],
+            error=zero,
+            covariance=H,
+            modes=Modes.alone(T, zero, H),
+        )
+
+
+@pytest.fixture
+def compiled():
+    """Names of functions, as they are compiled."""
+    names = []
+
+    def hear(event, duration, **about):
+        if event.endswith("backend_compile_duration"):
+            names.append(about["fun_name"])
+
+    jax.monitoring.register_event_duration_secs_listener(hear)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(hear)
+
+
+def _ragged(num: int):
+    rng = np.random.default_rng(0)
+    rows = np.arange(num)
+    sources = [rng.standard_normal((450 + k, 3)).astype(np.float32) for k in rows]
+    targets = [rng.standard_normal((860 - k, 3)).astype(np.float32) for k in rows]
+    return sources, targets
+
+
+def test_lists_of_similar_sizes_compile_once(compiled):
+    sources, targets = _ragged(20)
+    source_mask = [None] * 19 + [np.arange(469) < 100]
+    sol = jr.register(sources, targets, _Centroids(), source_mask=source_mask)
+    programs = [name for name in compiled if "register" in name]
+    assert len(programs) == 1
+    assert len(compiled) < 20  # what the host does compiles for no size of its own
+    alike = [np.stack([x[:100] for x in xs]) for xs in (sources, targets)]
+    batch = jr.register(alike[0], alike[1], _Centroids()).T_target_source[:, :3, 3]
+    np.testing.assert_allclose(batch, alike[1].mean(1) - alike[0].mean(1), atol=1e-5)
+    sources[-1] = sources[-1][:100]
+    shift = [t.mean(0) - s.mean(0) for s, t in zip(sources, targets, strict=True)]
+    np.testing.assert_allclose(sol.T_target_source[:, :3, 3], shift, atol=1e-5)
+    np.testing.assert_array_equal(sol.num_inliers, [len(s) for s in sources])
+
+
+def test_lists_of_very_different_sizes_are_grouped(monkeypatch, compiled):
+    sources, targets = _ragged(9)
+    sources[4] = sources[4][:5]
+    targets[6] = targets[6][:0]
+    monkeypatch.setattr(many, "_MOST_PADDING", 300)
+    sol = jr.register(sources, targets, _Centroids())
+    assert len([name for name in compiled if "register" in name]) == 3
+    few = np.arange(9) == 6
+    np.testing.assert_array_equal(
+        sol.status, np.where(few, Status.TOO_FEW_POINTS, Status.CONVERGED)
+    )
+    shift = [t.sum(0) / max(len(t), 1) for t in targets]
+    shift = np.array(shift) - [s.mean(0) for s in sources]
+    shift[6] = 0
+    np.testing.assert_allclose(sol.T_target_source[:, :3, 3], shift, atol=1e-5)
+    inside = jax.jit(lambda s, t: jr.register(s, t, _Centroids()).T_target_source)
+    np.testing.assert_allclose(inside(sources, targets), sol.T_target_source, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["filter", "icp"])
+def test_padding_changes_an_answer_by_rounding_only(name, compiled):
+    pairs = [_pair(3, seed, angle=0.3) for seed in (3, 4)]
+    sources, targets, T = (list(x) for x in zip(*pairs, strict=True))
+    sources.append(sources[0][:40])  # too few for a search, but some
+    targets.append(targets[0][:0])
+    T.append(np.eye(4))
+    init = [motion(9, 3, angle=0.1, shift=0.05) @ x for x in T]
+    if name == "filter":
+        method, init, key = FILTER, None, jax.random.key(7)
+        other = dataclasses.replace(method, min_overlap=0.2)
+        keys = list(jax.random.split(key, 3))
+    else:
+        method, key, keys, other = jr.ICP(), None, [None] * 3, jr.ICP(tolerance=1e-3)
+    sol = jr.register(sources, targets, method, init, key)
     for k in range(2):
-        single = jr.register(source[k], target[k], FILTER, key=keys[k])
-        assert pose_error(first.T_target_source[k], single.T_target_source)[0] < 1e-3
+        guess = None if init is None else init[k]
+        alone = jr.register(sources[k], targets[k], method, guess, keys[k])
+        lane = jax.tree.map(lambda x, k=k: x[k], sol)
+        for field in ("T_target_source", "fitness", "overlap", "inlier_rmse"):
+            np.testing.assert_allclose(
+                getattr(lane, field), getattr(alone, field), atol=1e-3, err_msg=field
+            )
+        assert int(lane.status) == int(alone.status)
+    assert int(sol.status[2]) == Status.TOO_FEW_POINTS
+    compiled.clear()
+    jr.register(sources, targets, other, init, key)
+    assert not [name for name in compiled if "register" in name]
 
 
 def test_jit_vmap_and_pickle():
@@ -235,6 +347,10 @@ def test_a_symmetric_object_is_ambiguous_and_its_modes_are_the_symmetrys(shape):
         assert abs(turned[2, 2]) > 0.99
 
 
+CUBE = np.ones((5, 3), np.float32)
+TWO = {"target": [CUBE] * 2}
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
@@ -250,6 +366,13 @@ def test_a_symmetric_object_is_ambiguous_and_its_modes_are_the_symmetrys(shape):
         ({"key": jnp.ones(3)}, TypeError, "key.*float32"),
         ({"key": None}, ValueError, r"key.*jax\.random\.key"),
         ({"method": "icp"}, TypeError, "method.*str"),
+        ({"source": [CUBE] * 2}, TypeError, "target.*a list"),
+        ({"source": [CUBE] * 2, "target": [CUBE]}, ValueError, "length.* 2 and 1"),
+        ({"source": [CUBE, CUBE[:, :2]], **TWO}, ValueError, r"source\[1\].*\(n, 3\)"),
+        ({"source": [CUBE, np.float16(CUBE)], **TWO}, TypeError, r"source\[1\].*16"),
+        ({"source": [CUBE[:, :2]] * 2, **TWO}, ValueError, r"target\[0\].*dimension 2"),
+        ({"source": [CUBE] * 2, **TWO, "target_mask": [None]}, ValueError, "list of 2"),
+        ({"source": [CUBE] * 2, **TWO, "init": np.ones((3, 4, 4))}, ValueError, "init"),
     ],
 )
 def test_wrong_arguments_are_named(change, error, words):

@@ -37,7 +37,8 @@ def as_float_array(x: object, name: str) -> Array:
             raise TypeError(f"{name}: wanted numbers, found dtype {x.dtype}.")
         if x.dtype == np.float64 and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
             x = x.astype(np.float32)
-    out = jnp.asarray(x)
+    # Of NumPy arrays `jnp.asarray` compiles a program for each size.
+    out = x if isinstance(x, jax.Array) else jax.device_put(x)
     if jnp.issubdtype(out.dtype, jnp.integer):
         return out.astype(jnp.result_type(float))
     if out.dtype not in (jnp.float32, jnp.float64):
@@ -61,7 +62,7 @@ def check_mask(mask: object, shape: tuple[int, ...], name: str) -> Array:
     """Returns a boolean mask of `shape`; None stands for everything valid."""
     if mask is None:
         return jnp.ones(shape, dtype=bool)
-    out = jnp.asarray(mask)
+    out = mask if isinstance(mask, jax.Array) else jax.device_put(np.asarray(mask))
     if out.dtype != bool:
         raise TypeError(f"{name}: wanted a boolean mask, found dtype {out.dtype}.")
     if out.shape != shape:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Int
 
 from jaxreg._core.checks import as_float_array, check_mask, is_concrete
 
@@ -106,3 +106,19 @@ def stacked(arrays: Sequence[Array], num_rows: int) -> Array:
     for i, x in enumerate(arrays):
         out = out.at[i, : len(x)].set(x)
     return out
+
+
+def spread_rows(
+    mask: Bool[Array, " n"], num: int
+) -> tuple[Int[Array, " r"], Bool[Array, " r"]]:
+    """At most `num` valid rows, evenly spread, and which of them are in use.
+
+    The same for any number of masked rows.
+    """
+    num = min(num, mask.shape[0])
+    count = jnp.cumsum(mask.astype(jnp.int32))
+    at, used = jnp.arange(num, dtype=jnp.int32), jnp.minimum(count[-1], num)
+    # The valid row of that rank; searched, not sorted.
+    rank = at * (count[-1] - 1) // jnp.maximum(used - 1, 1)
+    row = jnp.searchsorted(count, rank + 1).astype(jnp.int32)
+    return jnp.minimum(row, len(mask) - 1), at < used

@@ -13,8 +13,6 @@ from jaxreg._core.typing import Mask, Points, Scalar
 
 
 UNUSED = jnp.iinfo(jnp.int32).max
-# Share of the cells that are filled in the first attempt to fill at most so many.
-_FULL = 0.95
 
 
 def bits_per_axis(d: int) -> int:
@@ -89,11 +87,17 @@ def cells_in_order(
 
 
 def at_most(
-    cap: int, points: Points, mask: Mask, low: Float[Array, " d"], side: Scalar
+    cap: int,
+    points: Points,
+    mask: Mask,
+    low: Float[Array, " d"],
+    side: Scalar,
+    size: Scalar,
 ) -> tuple[Float[Array, ""], Int[Array, " n"], Int[Array, " n"]]:
-    """The size at which nearly and at most `cap` cells are filled, and their order.
+    """The first size from `size` up at which at most `cap` cells are filled.
 
-    Of more than `cap` points: the first order is not one, but a key each.
+    And the points' order and keys. Of more than `cap` rows: the first order is not
+    one, but a key each.
     """
 
     def too_many(state: tuple[Array, Array, Array]) -> Array:
@@ -105,6 +109,5 @@ def at_most(
         return size, *cells_in_order(points, mask, low, size)
 
     # Starts below and not in order, so that the order is computed in one place.
-    size = cell_size(points, mask, low, side, _FULL * cap) / 1.05
     start = jnp.arange(points.shape[0], dtype=jnp.int32)
-    return lax.while_loop(too_many, coarser, (size, start, start))
+    return lax.while_loop(too_many, coarser, (size / 1.05, start, start))

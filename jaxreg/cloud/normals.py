@@ -37,7 +37,7 @@ def normals_from_cells(
     points: Float[Array, "n d"],
     keys: Int[Array, " n"],
     size: Scalar,
-    finest: int,
+    finest: int | Int[Array, ""],
 ) -> Float[Array, "p d"]:
     """Unit normals of either sign at `places`; zero where undefined.
 

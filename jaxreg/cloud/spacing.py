@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core.padding import spread_rows
 from jaxreg._core.typing import Mask, Points
 
 
@@ -15,20 +16,15 @@ def median_spacing(points: Points, mask: Mask) -> Float[Array, ""]:
 
     The median distance from a valid point to its second other point on a curve, its
     fourth on a surface: the nearest one tells little of random samples. Measured from
-    64 rows spread over the array; duplicates of a point are skipped.
+    64 valid rows spread over the array; duplicates of a point are skipped.
 
     Gradients: cut.
     """
     points = lax.stop_gradient(points)
-    n = points.shape[0]
-    at = jnp.linspace(0, n - 1, min(_SAMPLES, n)).astype(jnp.int32)
-    # The valid row of that rank; searched, not sorted.
-    count = jnp.cumsum(mask.astype(jnp.int32))
-    rank = (at * count[-1]) // n + 1
-    at = jnp.minimum(jnp.searchsorted(count, rank), n - 1)
+    at, use = spread_rows(mask, _SAMPLES)
     columns = points.T
     other = lax.map(lambda row: _distance_to_other(points[row], columns, mask), at)
-    use = mask[at] & (other > 0)
+    use = use & (other > 0)
     spacing = jnp.nanmedian(jnp.where(use, other, jnp.nan))
     return jnp.where(jnp.any(use), spacing, 0)
 

@@ -15,6 +15,8 @@ from jaxreg.geometry.boxes import bounding_cube
 
 # Points in a cell of the size that normals are estimated with, where none are merged.
 _POINTS_PER_CELL = 1.6
+# Share of the cells that are filled in the first attempt to fill at most so many.
+_FULL = 0.95
 # Points in a merged cell from which on its own moments tell the normal.
 _MANY = 4
 
@@ -25,7 +27,7 @@ def thin(
     """At most `capacity` points in spatial order, with normals from all the points.
 
     Points that share a cell are replaced by their mean; the cell is chosen as small
-    as the capacity allows. A cloud that fits keeps its points.
+    as the capacity allows. A cloud whose valid points fit keeps them.
 
     Args:
         points: `(n, d)`.
@@ -43,7 +45,10 @@ def thin(
     ordered, valid = points[rows] - low, mask[rows]
     places = jnp.where(valid[:, None], ordered, 0)
     samples = lax.stop_gradient(places)
-    cell = _cell_numbers(keys) if merge else jnp.arange(n, dtype=jnp.int32)
+    num = jnp.sum(mask)
+    cell = jnp.arange(n, dtype=jnp.int32)
+    if merge:
+        cell = jnp.where(num > capacity, _cell_numbers(keys), cell)
     count = valid.astype(points.dtype)
     if merge:
         count = jax.ops.segment_sum(count, cell, capacity)
@@ -52,7 +57,7 @@ def thin(
     frozen = lax.stop_gradient(places)
     if num_neighbours is None:
         # Cells that merge many points are windows already.
-        finest = 0 if n >= _MANY * capacity else 1
+        finest = jnp.where(num >= _MANY * capacity, 0, 1)
         normals = normals_from_cells(frozen, valid, samples, keys, size, finest)
     else:
         offset = jnp.where(keys[:, None] != UNUSED, samples - frozen[cell], 0)
@@ -79,18 +84,21 @@ def _cells(
 ) -> tuple[Array, Array, Array, Array]:
     """Corner and size of cells, rows in the order of the cells' keys, those keys.
 
-    At most `capacity` cells are filled; without, the cells are half as large as those
-    that hold a few points each.
+    At most `capacity` cells are filled by more points than that; else, the cells are
+    half as large as those that hold a few points each.
     """
     frozen = lax.stop_gradient(points)
     low, side = bounding_cube(frozen, mask)
-    if capacity is not None:
-        return low, *at_most(capacity, frozen, mask, low, side)
     num = jnp.sum(mask).astype(points.dtype)
-    few = jnp.maximum(num / _POINTS_PER_CELL, 1)
-    size = cell_size(frozen, mask, low, side, few) / 2
-    size = jnp.maximum(size, side / 1000)
-    return low, size, *cells_in_order(frozen, mask, low, size)
+    filled = jnp.maximum(num / _POINTS_PER_CELL, 1)
+    if capacity is not None:
+        filled = jnp.where(num > capacity, _FULL * capacity, filled)
+    size = cell_size(frozen, mask, low, side, filled)
+    fine = jnp.maximum(size / 2, side / 1000)
+    if capacity is None:
+        return low, fine, *cells_in_order(frozen, mask, low, fine)
+    size = jnp.where(num > capacity, size, fine)
+    return low, *at_most(capacity, frozen, mask, low, side, size)
 
 
 def _cell_numbers(keys: Array) -> Array:

@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.arrays import cast_floats, traced
+from jaxreg._core.padding import spread_rows
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import PointCloud, median_spacing, rms_radius, thin
@@ -229,5 +230,7 @@ class ICP(AbstractRegistrar):
         source = PointCloud(points, source.normals, source.mask)
         index = BruteForce.build(source.points, source.mask)
         problem = Problem.of(target, source, index)
-        some = problem.every(max(target.points.shape[0] // _SCORED_POINTS, 1))
+        rows, use = spread_rows(target.mask, _SCORED_POINTS)
+        some = problem.of_rows(rows)
+        some = eqx.tree_at(lambda p: p.source_mask, some, use)
         return score(some, lie.inverse(T), spacing).fitness
