@@ -156,9 +156,9 @@ def compiled():
     """Names of functions, as they are compiled."""
     names = []
 
-    def hear(event, duration, **about):
+    def hear(event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event.endswith("backend_compile_duration"):
-            names.append(about["fun_name"])
+            names.append(str(kwargs["fun_name"]))
 
     jax.monitoring.register_event_duration_secs_listener(hear)
     yield names

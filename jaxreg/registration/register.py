@@ -72,9 +72,10 @@ def register(
         more than 2^24 rows, each pair of sizes compiles once.
 
     Memory:
-        Pairs are registered one after another on each core. On a CPU, beyond the
-        inputs and one copy of them, that takes `PER_CORE` bytes a core. Under `jit`
-        and on an accelerator a list becomes one padded array.
+        Pairs are registered one after another on each core. On a CPU that takes, beyond
+        the inputs, one copy of them and about 10 MB + 900 (n + m) bytes a core, where
+        n and m are the padded sizes (`ICP`, float32). Under `jit` and on an accelerator
+        a list becomes padded arrays of 4 d + 1 bytes a row.
     """
     method = ParticleFilter() if method is None else method
     if not isinstance(method, AbstractRegistrar):
