@@ -24,7 +24,7 @@ from jaxreg.particle import (
     SquaredEnergy,
 )
 from jaxreg.particle.measure import measure
-from jaxreg.particle.modes import distinct_modes
+from jaxreg.particle.modes import distinct_modes, first_within
 from jaxreg.robust import L2
 
 
@@ -113,3 +113,11 @@ def test_modes_are_distinct_best_first_and_share_the_weight():
     row, mass = distinct_modes(particles, 4, angle=limit, distance=limit)
     np.testing.assert_array_equal(row[:3], [1, 0, 3])
     np.testing.assert_allclose(mass, [0.6, 0.35, 0.05, 0], atol=1e-6)
+
+
+def test_poses_that_coincide_count_as_the_first_of_them():
+    poses = [np.eye(4), motion(1, 3), motion(2, 3), np.full((4, 4), np.nan)]
+    T = jnp.asarray(np.stack([poses[r] for r in (1, 0, 1, 2, 0, 3)]), jnp.float32)
+    limit = jnp.asarray(0.1)
+    first = first_within(T, angle=limit, distance=limit)
+    np.testing.assert_array_equal(first, [0, 1, 0, 3, 1, 5])
