@@ -17,8 +17,9 @@ class PlaneToPlane(AbstractResidual):
 
     Each point stands for a disc of its surface with covariance I - (1 - epsilon) n n^T
     in its own frame; the residual counts in the inverse of the sum of both,
-    M = (C_q + R C_p R^T)^-1. A point without a normal has covariance I, so without
-    normals this is PointToPoint (times 1/2).
+    M = (C_q + R C_p R^T)^-1. A point without a normal takes that of its match: where
+    the source has none, this is point-to-plane. Without either it has covariance I, and
+    this is PointToPoint (times 1/2).
 
     The eigenvectors of C_q + R C_p R^T are s = n_q + n_p, a = n_q - n_p and what is
     orthogonal to both, with eigenvalues 2 - c (1 +- n_q . n_p) and 2, c = 1 - epsilon.
@@ -64,6 +65,8 @@ class PlaneToPlane(AbstractResidual):
     def _axes(self, match: Match) -> list[tuple[Array, Array]]:
         """Directions s and a, and c / (4 l) of each."""
         p, q = match.source_normal, match.normal
+        p = jnp.where(jnp.any(p != 0, axis=0), p, q)
+        q = jnp.where(jnp.any(q != 0, axis=0), q, p)
         c = 1 - jnp.asarray(self.epsilon, q.dtype)
         cosine = sum_rows(p * q)
         return [
