@@ -17,9 +17,9 @@ from jaxreg.local import (
     LocalOptimiser,
     Modes,
     PlaneToPlane,
+    PointToPlane,
     Problem,
     RegistrationSolution,
-    Score,
     match,
     score_both_ways,
 )
@@ -33,6 +33,8 @@ from jaxreg.robust import AbstractKernel
 _APART = 0.3
 # A second mode with more than this share of the overlap of the first is its rival.
 _RIVAL = 0.95
+# Steps of the most accurate residual, where it is close already.
+_POLISH = 8
 
 
 class Pair(eqx.Module):
@@ -85,9 +87,8 @@ def conclude(
     dtype = particles.energy.dtype
     limit = jnp.asarray(_APART, dtype)
     rows, mass = distinct_modes(particles, num_modes, angle=limit, distance=limit)
-    # Twice to three times as accurate as planes of the target alone.
     optimiser = cast_floats(
-        LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton()), dtype
+        LocalOptimiser(PointToPlane(), kernel, GaussNewton()), dtype
     )
     spacing = pair.spacing
     T_modes = particles.T_target_source[rows]
@@ -98,53 +99,67 @@ def conclude(
     eye = lie.identity(T_modes.shape[-1] - 1, dtype)
     T_modes = jnp.where(sound[:, None, None], T_modes, eye)
 
-    scores = lax.map(lambda T: _Mode.of(pair, T, optimiser, spacing), T_modes)
-    overlap = jnp.where(sound, scores.overlap, -1)
+    there, back = lax.map(
+        lambda T: score_both_ways(
+            pair.source, pair.target, pair.source_index, pair.target_index, T, spacing
+        ),
+        T_modes,
+    )
+    overlap = jnp.where(sound, jnp.minimum(there.fitness, back.fitness), -1)
     order = jnp.argsort(-overlap) if refine_steps else jnp.arange(num_modes)
-    T_modes, mass, overlap, scores = jax.tree.map(
-        lambda x: x[order], (T_modes, mass, overlap, scores)
+    T_modes, mass, overlap, there = jax.tree.map(
+        lambda x: x[order], (T_modes, mass, overlap, there)
     )
     # Refinement may lead two of them to one pose.
     first = first_within(T_modes, angle=limit, distance=limit)
     overlap = jnp.where(first == jnp.arange(num_modes), overlap, -1)
     if refine_steps:
         mass = _weights(overlap, pair)
-    best = jax.tree.map(lambda x: x[0], scores)
+    polish = cast_floats(
+        LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton()), dtype
+    )
+    T_modes, curvatures = _polished(
+        pair.problem, polish, T_modes, 0.5 * spacing, _POLISH if refine_steps else 0
+    )
+    best, curvature = jax.tree.map(lambda x: x[0], (there, curvatures))
     status = _status(overlap, pair, min_overlap, finished | (refine_steps > 0))
     return RegistrationSolution(
         T_target_source=T_modes[0],
         status=status,
-        fitness=best.there.fitness,
-        inlier_rmse=best.there.inlier_rmse,
-        num_inliers=best.there.num_inliers,
+        fitness=best.fitness,
+        inlier_rmse=best.inlier_rmse,
+        num_inliers=best.num_inliers,
         overlap=jnp.maximum(overlap[0], 0),
         num_steps=(num_steps + refine_steps).astype(jnp.int32),
-        H=best.curvature.H,
-        b=best.curvature.b,
-        error=best.curvature.error,
-        covariance=best.curvature.covariance,
-        modes=Modes(T_modes, mass, scores.there.fitness, scores.curvature.covariance),
+        H=curvature.H,
+        b=curvature.b,
+        error=curvature.error,
+        covariance=curvature.covariance,
+        modes=Modes(T_modes, mass, there.fitness, curvatures.covariance),
     )
 
 
-class _Mode(eqx.Module):
-    """What is known of a pose: its scores and the curvature of the energy."""
+def _polished(
+    problem: Problem,
+    optimiser: LocalOptimiser,
+    T: Float[Array, "q D D"],
+    width: Scalar,
+    num_steps: int,
+) -> tuple[Float[Array, "q D D"], Curvature]:
+    """The last steps, in the metric of both surfaces, and the curvature there.
 
-    there: Score
-    overlap: Float[Array, "*q"]
-    curvature: Curvature
+    Three times as accurate as planes of the target alone; but modes are compared
+    before, as wrong ones gain more by it than right ones.
+    """
 
-    @classmethod
-    def of(
-        cls, pair: Pair, T: Motion, optimiser: LocalOptimiser, spacing: Scalar
-    ) -> "_Mode":
-        there, back = score_both_ways(
-            pair.source, pair.target, pair.source_index, pair.target_index, T, spacing
-        )
-        found = match(pair.problem, T)
-        weight = optimiser.weights(found, 0.5 * spacing)
-        curvature = Curvature.of(optimiser.residual, found, weight)
-        return cls(there, jnp.minimum(there.fitness, back.fitness), curvature)
+    def one(T: Motion) -> tuple[Motion, Curvature]:
+        T = optimiser.repeat(problem, T, jnp.full(num_steps, width))
+        T = lie.orthonormalise(T)
+        found = match(problem, T)
+        weight = optimiser.weights(found, width)
+        return T, Curvature.of(optimiser.residual, found, weight)
+
+    return lax.map(one, T)
 
 
 def _weights(overlap: Float[Array, " q"], pair: Pair) -> Float[Array, " q"]:
