@@ -1,4 +1,4 @@
-"""From many measured poses to an answer: modes, refinement, scores, status."""
+"""From many measured poses to an answer: modes, refinement, scores, polish, status."""
 
 import equinox as eqx
 import jax
@@ -20,6 +20,7 @@ from jaxreg.local import (
     PointToPlane,
     Problem,
     RegistrationSolution,
+    Score,
     match,
     score_both_ways,
 )
@@ -87,25 +88,12 @@ def conclude(
     dtype = particles.energy.dtype
     limit = jnp.asarray(_APART, dtype)
     rows, mass = distinct_modes(particles, num_modes, angle=limit, distance=limit)
-    optimiser = cast_floats(
-        LocalOptimiser(PointToPlane(), kernel, GaussNewton()), dtype
-    )
     spacing = pair.spacing
-    T_modes = particles.T_target_source[rows]
-    if refine_steps:
-        T_modes = _refine(pair.problem, optimiser, T_modes, spacing, refine_steps)
-    T_modes = lie.orthonormalise(T_modes)
-    sound = jnp.all(jnp.isfinite(T_modes), axis=(1, 2)) & (mass > 0)
-    eye = lie.identity(T_modes.shape[-1] - 1, dtype)
-    T_modes = jnp.where(sound[:, None, None], T_modes, eye)
-
-    there, back = lax.map(
-        lambda T: score_both_ways(
-            pair.source, pair.target, pair.source_index, pair.target_index, T, spacing
-        ),
-        T_modes,
+    T_modes, sound = _refined(
+        pair.problem, kernel, particles.T_target_source[rows], spacing, refine_steps
     )
-    overlap = jnp.where(sound, jnp.minimum(there.fitness, back.fitness), -1)
+    there, overlap = _scores(pair, T_modes, spacing)
+    overlap = jnp.where(sound & (mass > 0), overlap, -1)
     order = jnp.argsort(-overlap) if refine_steps else jnp.arange(num_modes)
     T_modes, mass, overlap, there = jax.tree.map(
         lambda x: x[order], (T_modes, mass, overlap, there)
@@ -115,11 +103,8 @@ def conclude(
     overlap = jnp.where(first == jnp.arange(num_modes), overlap, -1)
     if refine_steps:
         mass = _weights(overlap, pair)
-    polish = cast_floats(
-        LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton()), dtype
-    )
     T_modes, curvatures = _polished(
-        pair.problem, polish, T_modes, 0.5 * spacing, _POLISH if refine_steps else 0
+        pair.problem, kernel, T_modes, 0.5 * spacing, _POLISH if refine_steps else 0
     )
     best, curvature = jax.tree.map(lambda x: x[0], (there, curvatures))
     status = _status(overlap, pair, min_overlap, finished | (refine_steps > 0))
@@ -137,29 +122,6 @@ def conclude(
         covariance=curvature.covariance,
         modes=Modes(T_modes, mass, there.fitness, curvatures.covariance),
     )
-
-
-def _polished(
-    problem: Problem,
-    optimiser: LocalOptimiser,
-    T: Float[Array, "q D D"],
-    width: Scalar,
-    num_steps: int,
-) -> tuple[Float[Array, "q D D"], Curvature]:
-    """The last steps, in the metric of both surfaces, and the curvature there.
-
-    Three times as accurate as planes of the target alone; but modes are compared
-    before, as wrong ones gain more by it than right ones.
-    """
-
-    def one(T: Motion) -> tuple[Motion, Curvature]:
-        T = optimiser.repeat(problem, T, jnp.full(num_steps, width))
-        T = lie.orthonormalise(T)
-        found = match(problem, T)
-        weight = optimiser.weights(found, width)
-        return T, Curvature.of(optimiser.residual, found, weight)
-
-    return lax.map(one, T)
 
 
 def _weights(overlap: Float[Array, " q"], pair: Pair) -> Float[Array, " q"]:
@@ -180,18 +142,63 @@ def _weights(overlap: Float[Array, " q"], pair: Pair) -> Float[Array, " q"]:
     return weight / jnp.maximum(jnp.sum(weight), jnp.finfo(short.dtype).tiny)
 
 
-def _refine(
+def _refined(
     problem: Problem,
-    optimiser: LocalOptimiser,
+    kernel: AbstractKernel,
     T: Float[Array, "q D D"],
     spacing: Scalar,
     num_steps: int,
-) -> Float[Array, "q D D"]:
-    """Many steps on all points, the width falling to the sample spacing."""
-    widths = spacing * jnp.geomspace(2, 0.5, num_steps, dtype=T.dtype)
+) -> tuple[Float[Array, "q D D"], Bool[Array, " q"]]:
+    """After many steps on all points, the width falling to the sample spacing.
 
-    def one(T: Motion) -> Motion:
-        return optimiser.repeat(problem, T, widths)
+    And which of the poses are sound; the others become the identity.
+    """
+    optimiser = LocalOptimiser(PointToPlane(), kernel, GaussNewton())
+    optimiser = cast_floats(optimiser, T.dtype)
+    if num_steps:
+        widths = spacing * jnp.geomspace(2, 0.5, num_steps, dtype=T.dtype)
+        T = lax.map(lambda T: optimiser.repeat(problem, T, widths), T)
+    T = lie.orthonormalise(T)
+    sound = jnp.all(jnp.isfinite(T), axis=(1, 2))
+    eye = lie.identity(T.shape[-1] - 1, T.dtype)
+    return jnp.where(sound[:, None, None], T, eye), sound
+
+
+def _scores(
+    pair: Pair, T: Float[Array, "q D D"], spacing: Scalar
+) -> tuple[Score, Float[Array, " q"]]:
+    """Of the source on the target, and the lesser share of both ways."""
+
+    def both(T: Motion) -> tuple[Score, Score]:
+        return score_both_ways(
+            pair.source, pair.target, pair.source_index, pair.target_index, T, spacing
+        )
+
+    there, back = lax.map(both, T)
+    return there, jnp.minimum(there.fitness, back.fitness)
+
+
+def _polished(
+    problem: Problem,
+    kernel: AbstractKernel,
+    T: Float[Array, "q D D"],
+    width: Scalar,
+    num_steps: int,
+) -> tuple[Float[Array, "q D D"], Curvature]:
+    """The last steps, in the metric of both surfaces, and the curvature there.
+
+    Three times as accurate as planes of the target alone; but modes are compared
+    before, as wrong ones gain more by it than right ones.
+    """
+    optimiser = LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton())
+    optimiser = cast_floats(optimiser, T.dtype)
+
+    def one(T: Motion) -> tuple[Motion, Curvature]:
+        T = optimiser.repeat(problem, T, jnp.full(num_steps, width))
+        T = lie.orthonormalise(T)
+        found = match(problem, T)
+        weight = optimiser.weights(found, width)
+        return T, Curvature.of(optimiser.residual, found, weight)
 
     return lax.map(one, T)
 

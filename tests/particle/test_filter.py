@@ -316,11 +316,12 @@ def test_pieces_of_smooth_surfaces_are_found_without_a_guess():
         rng = np.random.default_rng(k)
         T, normals = motion(k, 3), np.linalg.qr(rng.normal(size=(3, 3)))[0]
         sources.append(_three_quarters(_lump(800, k, 2 * k), normals[0]))
-        target = _three_quarters(_lump(800, k, 2 * k + 1), normals[1])
-        targets.append(move(T, target))
+        other = _three_quarters(_lump(800, k, 2 * k + 1), normals[1])
+        targets.append(move(T, other))
         truth.append(T)
-    clouds = (np.stack(x).astype(np.float32) for x in (sources, targets))
-    sol = register(*clouds, key=KEY)
+    source = np.stack(sources).astype(np.float32)
+    target = np.stack(targets).astype(np.float32)
+    sol = register(source, target, key=KEY)
     for k, T in enumerate(truth):
         angle, _ = pose_error(sol.T_target_source[k], T)
         assert angle < 0.05
