@@ -150,6 +150,23 @@ def test_plane_to_plane_without_normals_is_half_of_point_to_point():
         np.testing.assert_allclose(mine, points / 2, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("bare", ["normal", "source_normal"])
+def test_plane_to_plane_takes_a_missing_normal_from_the_other_surface(bare):
+    problem, T, weight = noisy_problem(3, np.float32)
+    found = found_at(problem, T)
+    other = found.source_normal if bare == "normal" else found.normal
+    missing, same = (
+        eqx.tree_at(lambda m: getattr(m, bare), found, x)
+        for x in (jnp.zeros_like(other), other)
+    )
+    for mine, wanted in zip(
+        _equations(PlaneToPlane(), missing, weight),
+        _equations(PlaneToPlane(), same, weight),
+        strict=True,
+    ):
+        np.testing.assert_allclose(mine, wanted, rtol=1e-5, atol=1e-5)
+
+
 def test_the_symmetric_residual_vanishes_for_two_points_of_one_circle():
     angle = np.linspace(0.1, 1.5, N)
     p = np.stack([np.cos(angle), np.sin(angle)], axis=1)
