@@ -89,11 +89,12 @@ def conclude(
     limit = jnp.asarray(_APART, dtype)
     rows, mass = distinct_modes(particles, num_modes, angle=limit, distance=limit)
     spacing = pair.spacing
+    T_modes = particles.T_target_source[rows]
     T_modes, sound = _refined(
-        pair.problem, kernel, particles.T_target_source[rows], spacing, refine_steps
+        pair.problem, kernel, T_modes, mass > 0, spacing, refine_steps
     )
     there, overlap = _scores(pair, T_modes, spacing)
-    overlap = jnp.where(sound & (mass > 0), overlap, -1)
+    overlap = jnp.where(sound, overlap, -1)
     order = jnp.argsort(-overlap) if refine_steps else jnp.arange(num_modes)
     T_modes, mass, overlap, there = jax.tree.map(
         lambda x: x[order], (T_modes, mass, overlap, there)
@@ -103,8 +104,9 @@ def conclude(
     overlap = jnp.where(first == jnp.arange(num_modes), overlap, -1)
     if refine_steps:
         mass = _weights(overlap, pair)
+    steps = _POLISH if refine_steps else 0
     T_modes, curvatures = _polished(
-        pair.problem, kernel, T_modes, 0.5 * spacing, _POLISH if refine_steps else 0
+        pair.problem, kernel, T_modes, overlap >= 0, 0.5 * spacing, steps
     )
     best, curvature = jax.tree.map(lambda x: x[0], (there, curvatures))
     status = _status(overlap, pair, min_overlap, finished | (refine_steps > 0))
@@ -146,12 +148,13 @@ def _refined(
     problem: Problem,
     kernel: AbstractKernel,
     T: Float[Array, "q D D"],
+    used: Bool[Array, " q"],
     spacing: Scalar,
     num_steps: int,
 ) -> tuple[Float[Array, "q D D"], Bool[Array, " q"]]:
     """After many steps on all points, the width falling to the sample spacing.
 
-    And which of the poses are sound; the others become the identity.
+    And which of the poses in use are sound; the others become the identity.
     """
     optimiser = LocalOptimiser(PointToPlane(), kernel, GaussNewton())
     optimiser = cast_floats(optimiser, T.dtype)
@@ -159,7 +162,7 @@ def _refined(
         widths = spacing * jnp.geomspace(2, 0.5, num_steps, dtype=T.dtype)
         T = lax.map(lambda T: optimiser.repeat(problem, T, widths), T)
     T = lie.orthonormalise(T)
-    sound = jnp.all(jnp.isfinite(T), axis=(1, 2))
+    sound = used & jnp.all(jnp.isfinite(T), axis=(1, 2))
     eye = lie.identity(T.shape[-1] - 1, T.dtype)
     return jnp.where(sound[:, None, None], T, eye), sound
 
@@ -182,25 +185,27 @@ def _polished(
     problem: Problem,
     kernel: AbstractKernel,
     T: Float[Array, "q D D"],
+    sound: Bool[Array, " q"],
     width: Scalar,
     num_steps: int,
 ) -> tuple[Float[Array, "q D D"], Curvature]:
     """The last steps, in the metric of both surfaces, and the curvature there.
 
     Three times as accurate as planes of the target alone; but modes are compared
-    before, as wrong ones gain more by it than right ones.
+    before, as wrong ones gain more by it than right ones. What is no mode stays.
     """
     optimiser = LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton())
     optimiser = cast_floats(optimiser, T.dtype)
 
-    def one(T: Motion) -> tuple[Motion, Curvature]:
-        T = optimiser.repeat(problem, T, jnp.full(num_steps, width))
-        T = lie.orthonormalise(T)
+    def one(mode: tuple[Motion, Bool[Array, ""]]) -> tuple[Motion, Curvature]:
+        T, sound = mode
+        polished = optimiser.repeat(problem, T, jnp.full(num_steps, width))
+        T = jnp.where(sound, lie.orthonormalise(polished), T)
         found = match(problem, T)
         weight = optimiser.weights(found, width)
         return T, Curvature.of(optimiser.residual, found, weight)
 
-    return lax.map(one, T)
+    return lax.map(one, (T, sound))
 
 
 def _status(
