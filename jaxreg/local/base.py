@@ -4,13 +4,16 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax.scipy.special import gammainc
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import PointCloud
+from jaxreg.geometry import lie
 
 
 class Modes(eqx.Module):
@@ -50,6 +53,40 @@ class Modes(eqx.Module):
         """(sum w)^2 / sum w^2: how many modes share the posterior."""
         return jnp.sum(self.weight, -1) ** 2 / jnp.sum(self.weight**2, -1)
 
+    def contains(
+        self,
+        T_target_source: Motion,
+        centroid: Float[Array, " d"],
+        probability: Float[Array, ""] | float = 0.95,
+    ) -> Bool[Array, ""]:
+        """Whether a pose lies in the region that holds the truth with a probability.
+
+        The region is the ellipsoids of that probability about the fewest modes that
+        together weigh as much. For the modes of one pair; `vmap` for those of many.
+
+        Args:
+            T_target_source: `(d+1, d+1)` the pose.
+            centroid: `(d,)` mean of the source's points, which the covariances are
+                about.
+            probability: in (0, 1).
+        """
+        R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
+        R_modes = lie.rotation(self.T_target_source)
+        t_modes = lie.translation(self.T_target_source)
+        turn = jax.vmap(lie.rotation_log)(jnp.einsum("ij,qkj->qik", R, R_modes))
+        shift = (R - R_modes) @ centroid + t - t_modes
+        error = jnp.concatenate([shift, turn], axis=1)
+        # Of unit diagonal: lengths may be of any unit.
+        unit = jnp.sqrt(jnp.diagonal(self.covariance, axis1=1, axis2=2))
+        error, shape = error / unit, self.covariance / unit[:, :, None] / unit[:, None]
+        sq = jnp.sum(
+            error * jnp.linalg.solve(shape, error[:, :, None])[:, :, 0], axis=1
+        )
+        near = gammainc(error.shape[1] / 2, sq / 2) <= probability
+        heavier = self.weight[:, None] > self.weight
+        before = jnp.sum(jnp.where(heavier, self.weight[:, None], 0), axis=0)
+        return jnp.any(near & (before < probability) & (self.weight > 0))
+
 
 class RegistrationSolution(eqx.Module):
     """The pose of a source in the frame of a target, and how far to trust it.
@@ -68,9 +105,9 @@ class RegistrationSolution(eqx.Module):
             the image of the source's centroid.
         b: `(k,)` its descent direction, nearly zero at a minimum.
         error: that energy, the weighted sum of half squared residuals.
-        covariance: `(k, k)` of the same tangent, by Huber's sandwich: right for
-            independent errors of any size, too small where neighbouring points err
-            together. Lengths are in the unit of the input.
+        covariance: `(k, k)` of the pose's error in the same tangent, by a sandwich of
+            estimating equations (`pose_covariance` in `jaxreg.local.curvature`);
+            lengths are in the unit of the input.
         modes: distinct poses with weights; one for a local method.
     """
 

@@ -140,7 +140,9 @@ class ICP(AbstractRegistrar):
         status = jnp.where(worse, Status.DIVERGED, status)
         T = lie.compose(scale * lie.rotation(T), lie.translation(T))
         status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
-        curvature = Curvature.of(self.residual, found, weight)
+        curvature = Curvature.of(
+            self._optimiser, problem.scaled(scale), end.T_matched, found, end.width
+        )
         return RegistrationSolution(
             T_target_source=T,
             status=status.astype(jnp.int32),

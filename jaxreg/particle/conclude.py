@@ -202,8 +202,7 @@ def _polished(
         polished = optimiser.repeat(problem, T, jnp.full(num_steps, width))
         T = jnp.where(sound, lie.orthonormalise(polished), T)
         found = match(problem, T)
-        weight = optimiser.weights(found, width)
-        return T, Curvature.of(optimiser.residual, found, weight)
+        return T, Curvature.of(optimiser, problem, T, found, width)
 
     return lax.map(one, (T, sound))
 
