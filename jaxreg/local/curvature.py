@@ -152,7 +152,7 @@ def _answer(
     here = match(few, T_target_source, row=found.row[::every])
     normal = here.source_normal
 
-    def pull(side: int) -> Array:
+    def pull(side: Array) -> Array:
         """Along the normals, `reach` away on that side."""
         away = few.source + side * reach * few.source_normals
         there = eqx.tree_at(lambda p: p.source, few, away)
@@ -160,7 +160,9 @@ def _answer(
         weight = optimiser.weights(moved, width) * found.mask[::every]
         return weight * sum_rows(normal * optimiser.residual.descents(moved)[:d])
 
-    slope = (pull(-1) - pull(1)) / (2 * jnp.where(reach > 0, reach, 1))
+    sides = jnp.asarray([-1, 1], reach.dtype)
+    before, behind = jax.vmap(pull)(sides)  # one search for both
+    slope = (before - behind) / (2 * jnp.where(reach > 0, reach, 1))
     slope = slope * jnp.sign(sum_rows(normal * here.normal))
     by_source, by_target = along(normal, here)[:-1], along(here.normal, here)[:-1]
     A = full_matmul(by_source * slope, by_target.T)
