@@ -70,6 +70,7 @@ from jaxreg.multiview import ReconstructionSolution as ReconstructionSolution
 from jaxreg.multiview import reconstruct as reconstruct
 from jaxreg.neighbours import BoxTree as BoxTree
 from jaxreg.neighbours import BruteForce as BruteForce
+from jaxreg.neighbours import CellGrid as CellGrid
 from jaxreg.neighbours import VoxelTable as VoxelTable
 from jaxreg.neighbours import correspondences as correspondences
 from jaxreg.particle import MultiStart as MultiStart

@@ -28,7 +28,7 @@ _COARSEST = 3
 _SPAN_SQ = 0.03
 _MIN_POINTS = 5
 # Places that are answered at once.
-_BLOCK = 1024
+_BLOCK = 256
 
 
 def normals_from_cells(

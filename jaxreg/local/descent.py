@@ -1,4 +1,8 @@
-"""The loop of a local registration: match, weigh, step, until nothing moves."""
+"""The loop of a local registration: match, weigh, step, until nothing moves.
+
+From coarse to fine: while steps are large, a subset of the source is matched, by the
+quickest look-up that the index has (a table); then all points by the index itself.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -99,7 +103,8 @@ def descend(
             num = jnp.where(state.fine, n, -(-n // step))
         if limits.with_scale:
             part = part.scaled(state.scale)
-        found = limits.within_reach(match(part, state.T, num=num))
+        found = match(part, state.T, num=num, coarse=~state.fine)
+        found = limits.within_reach(found)
         width = optimiser.kernel.width_of(found.sq_residual, found.mask)
         width = jnp.maximum(jnp.minimum(width, state.width), limits.floor)
         weight = optimiser.weights(found, width)

@@ -26,7 +26,7 @@ from jaxreg.local.residuals import AbstractResidual, PlaneToPlane
 from jaxreg.local.scale import fit_scale
 from jaxreg.local.score import score, score_match
 from jaxreg.local.steps import AbstractStep, GaussNewton, GradientDescent
-from jaxreg.neighbours import AbstractIndex, BruteForce, exact_index
+from jaxreg.neighbours import AbstractIndex, BruteForce, index_within
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
 
@@ -44,7 +44,9 @@ class ICP(AbstractRegistrar):
         residual: what is made small.
         kernel: how much a residual counts.
         step: how the pose follows.
-        index: class of the index of closest points; None chooses the faster exact one.
+        index: class of the index of closest points. None: for more than 1,500 points
+            the voxel table of a `CellGrid` while steps are large, then its cells, exact
+            within the sample spacing; else `BruteForce`.
         max_steps: iterations at most.
         max_points: both clouds are thinned to about this many points.
         max_correspondence_distance: farther pairs do not count, in the unit of the
@@ -109,7 +111,7 @@ class ICP(AbstractRegistrar):
         self = cast_floats(self, dtype)
         init, start_scale = self._start(source, target, init)
         spacing = median_spacing(target.points, target.mask)
-        problem = Problem.of(source, target, self._indexed(target))
+        problem = Problem.of(source, target, self._indexed(target, spacing))
         limits = self._limits(spacing)
         frozen, init, start_scale = lax.stop_gradient((problem, init, start_scale))
         end = descend(self._optimiser, frozen, init, start_scale, limits)
@@ -171,9 +173,10 @@ class ICP(AbstractRegistrar):
             tolerance=jnp.asarray(self.tolerance, spacing.dtype),
         )
 
-    def _indexed(self, cloud: PointCloud) -> AbstractIndex:
-        index = self.index or exact_index(cloud.points.shape[0])
-        return index.build(cloud.points, cloud.mask)
+    def _indexed(self, cloud: PointCloud, spacing: Scalar) -> AbstractIndex:
+        if self.index is None:
+            return index_within(cloud.points, cloud.mask, spacing)
+        return self.index.build(cloud.points, cloud.mask)
 
     def _start(
         self, source: PointCloud, target: PointCloud, init: Motion | None

@@ -129,17 +129,24 @@ def match(
     T_target_source: Motion,
     row: Int[Array, " n"] | None = None,
     num: Int[Array, ""] | None = None,
+    coarse: Bool[Array, ""] | None = None,
 ) -> Match:
     """Closest target points of the source under a pose (PF paper, Eq. 2).
 
     Where `row` is given, those rows of the target are taken instead of the closest;
-    with `num`, matches of source points beyond the first `num` are arbitrary.
+    with `num`, matches of source points beyond the first `num` are arbitrary; where
+    `coarse` is True, an index may take a near point for the closest.
     """
     d = problem.source.shape[0]
     R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
     rotated = rotate(R, problem.source)
     moved = rotated + t[:, None]
-    row = problem.index.lookup(moved, num) if row is None else row
+    if row is None:
+        row = (
+            problem.index.lookup(moved, num)
+            if coarse is None
+            else problem.index.lookup_staged(moved, coarse, num)
+        )
     found = problem.target[row]
     normal = jnp.stack([found[:, d + k] for k in range(d)])
     residual = jnp.stack([found[:, k] for k in range(d)]) - moved

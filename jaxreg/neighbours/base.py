@@ -61,6 +61,15 @@ class AbstractIndex(eqx.Module):
         beyond the first `num`, which save their time.
         """
 
+    def lookup_staged(
+        self,
+        columns: Float[Array, "d n"],
+        coarse: Bool[Array, ""],
+        num: Int[Array, ""] | None = None,
+    ) -> Int[Array, " n"]:
+        """`lookup`, or where `coarse` is True an approximation if that is quicker."""
+        return self.lookup(columns, num)
+
     def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
         """The rows of the k closest valid targets, nearest first; -1 for surplus."""
         raise ValueError(

@@ -1,10 +1,15 @@
 """The points closest to the centre of every cell of a grid, by separable sweeps.
 
 Cells that hold points start with those nearest to their centre. Candidates then spread
-by a forward and a backward sweep along each axis, twice: a cell keeps the nearest of
-its own candidates and those of the cell before it. This is the feature transform that
-distance transforms are made of (Danielsson 1980), for lists of candidates; like it, it
-misses a closer point in a few cells.
+by a forward and a backward sweep along each axis: a cell keeps the nearest of its own
+candidates and those of the cell before it. This is the feature transform that distance
+transforms are made of (Danielsson 1980), for lists of candidates; like it, it misses a
+closer point in a few cells.
+
+From coarse to fine: a grid of half the resolution is swept twice, and its candidates
+start the fine one, which is then swept once. That takes two thirds of the time of two
+sweeps of the fine grid (K = 1, 10,000 points in 64^3 cells: 10 for 15 ms on one core)
+and answers as closely. More levels save no more.
 
 Coordinates are in units of cells here, so that nothing depends on their scale.
 """
@@ -15,13 +20,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 
-_SWEEPS = 2
+# Grids of fewer cells along an axis are not halved.
+_COARSEST = 16
 
 
 def feature_transform(
     in_cells: Float[Array, "m d"],
     mask: Bool[Array, " m"],
-    home: Int[Array, " m"],
     resolution: int,
     candidates: int,
 ) -> Int[Array, "k cells"]:
@@ -30,24 +35,61 @@ def feature_transform(
     Args:
         in_cells: points from the grid's origin, in units of cells.
         mask: True for valid points.
-        home: the cell of each point.
         resolution: cells along each axis.
         candidates: k.
     """
-    d = in_cells.shape[1]
-    seed = _closest_in_each_cell(in_cells, mask, home, resolution**d, candidates)
-    table = seed.reshape(candidates, *(resolution,) * d)
+    if resolution % 2 or resolution <= _COARSEST:
+        table = _closest_in_each_cell(in_cells, mask, resolution, candidates)
+        table = _sweep_all(table, in_cells)
+    else:
+        half = resolution // 2
+        coarse = _closest_in_each_cell(in_cells / 2, mask, half, candidates)
+        coarse = _sweep_all(_sweep_all(coarse, in_cells / 2), in_cells / 2)
+        table = _closest_in_each_cell(in_cells, mask, resolution, candidates)
+        table = _merge_cells(table, _doubled(coarse), in_cells)
+    return _sweep_all(table, in_cells).reshape(candidates, -1)
+
+
+def _doubled(table: Array) -> Array:
+    """Each cell's candidates in the 2^d cells that it is divided into."""
+    for axis in range(1, table.ndim):
+        table = jnp.repeat(table, 2, axis=axis)
+    return table
+
+
+def _merge_cells(own: Array, other: Array, in_cells: Array) -> Array:
+    """The nearest of two tables' candidates in every cell."""
+    candidates, resolution, *_ = own.shape
+    centres = jnp.arange(resolution, dtype=in_cells.dtype) + 0.5
+    grid = jnp.meshgrid(*[centres] * (own.ndim - 1), indexing="ij")
+    merge = _closer if candidates == 1 else _merge
+    merged = merge(
+        own.reshape(candidates, -1),
+        other.reshape(candidates, -1),
+        list(in_cells.T),
+        [jnp.ravel(x) for x in grid],
+    )
+    return merged.reshape(own.shape)
+
+
+def _sweep_all(table: Array, in_cells: Array) -> Array:
+    """A sweep along each axis in turn."""
     axes = list(in_cells.T)
-    for _ in range(_SWEEPS):
-        for axis in range(d):
-            table = _sweep(table, axes, axis)
-    return table.reshape(candidates, -1)
+    for axis in range(len(axes)):
+        table = _sweep(table, axes, axis)
+    return table
 
 
 def _closest_in_each_cell(
-    in_cells: Array, mask: Array, home: Array, cells: int, candidates: int
-) -> Int[Array, "k cells"]:
+    in_cells: Array, mask: Array, resolution: int, candidates: int
+) -> Array:
     """Of the points in a cell, those nearest to its centre."""
+    d = in_cells.shape[1]
+    cells = resolution**d
+    at = jnp.clip(in_cells, 0, resolution - 1).astype(jnp.int32)
+    home = jnp.zeros(len(at), jnp.int32)
+    for axis in range(d):
+        home = home * resolution + at[:, axis]
     to_centre = in_cells - jnp.floor(in_cells) - 0.5
     sq = jnp.where(mask, jnp.sum(to_centre**2, axis=-1), jnp.inf)
     rows = jnp.arange(len(in_cells), dtype=jnp.int32)
@@ -58,7 +100,8 @@ def _closest_in_each_cell(
         row = jax.ops.segment_max(jnp.where(winner, rows, -1), home, cells)
         return jnp.where(row[home] == rows, jnp.inf, sq), jnp.maximum(row, -1)
 
-    return lax.scan(take, sq, None, candidates)[1]
+    found = lax.scan(take, sq, None, candidates)[1]
+    return found.reshape(candidates, *(resolution,) * d)
 
 
 def _sweep(table: Array, axes: list[Array], axis: int) -> Array:

@@ -86,11 +86,9 @@ class VoxelTable(AbstractIndex):
         mask = finite if mask is None else mask & finite
         frozen = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
         origin, cell = _grid(frozen, mask, resolution, margin)
-        home = _cell_of(frozen.T, origin, cell, resolution)
         # In units of cells: safe in float32.
-        rows = feature_transform(
-            (frozen - origin) / cell, mask, home, resolution, candidates
-        )
+        in_cells = (frozen - origin) / cell
+        rows = feature_transform(in_cells, mask, resolution, candidates)
         if candidates == 1:
             table, coordinates = jnp.maximum(rows[0], 0), None
         else:

@@ -7,16 +7,22 @@ import pytest
 from clouds import M, N, clouds, compiled, distances, few, kinds, scales, seeds
 from hypothesis import given
 
-from jaxreg.neighbours import AbstractIndex, BoxTree, BruteForce, VoxelTable
+from jaxreg.neighbours import (
+    AbstractIndex,
+    BoxTree,
+    BruteForce,
+    CellGrid,
+    VoxelTable,
+)
 
 
 EXACT = [BruteForce, BoxTree]
-INDEXES = [*EXACT, VoxelTable]
+INDEXES = [*EXACT, VoxelTable, CellGrid]
+OPTIONS = {VoxelTable: {"resolution": 16}, CellGrid: {"radius": 0.5}}
 
 
 def _compiled(index):
-    options = {"resolution": 16} if index is VoxelTable else {}
-    return compiled(index, **options)
+    return compiled(index, **OPTIONS.get(index, {}))
 
 
 @pytest.mark.parametrize("d", [2, 3])

@@ -1,0 +1,206 @@
+"""Exact closest points within a radius: points in cells twice the radius wide.
+
+Whatever lies within the radius of a query lies in the 2^d cells around the corner that
+is nearest to it (Bentley and Friedman 1979, Data structures for range searching). Cells
+that follow each other along the first axis hold points that do, so that a query is
+compared with those of 2^(d-1) runs in memory.
+
+Beyond the radius the answer is that of a voxel table or a nearer one: near, seldom the
+closest. The same table answers alone while a registration still takes large steps.
+"""
+
+import itertools
+import math
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.padding import spread_rows
+from jaxreg._core.sorting import rows_in_order
+from jaxreg._core.typing import Mask, Points, Scalar
+from jaxreg.geometry.spacing import median_spacing
+from jaxreg.neighbours.base import AbstractIndex, Neighbours, map_first
+from jaxreg.neighbours.voxel_table import VoxelTable
+
+
+_TILE = 512
+_UNROLL = 2
+# Of the table, filled in half a millisecond on one core of a CPU.
+_RESOLUTION = {2: 64, 3: 16}
+# Cells are this much wider than two radii, for the rounding of coordinates.
+_SLACK = 1.01
+# The grid reaches from the median of this many points as many median distances, so that
+# no few points far away make cells wide; those are in the border's.
+_SAMPLES = 256
+_REACH = 4
+
+
+class CellGrid(AbstractIndex):
+    """Exact within a radius, from a hundred to a million targets; O(n + m) memory.
+
+    Five to seven million queries a second on one core of a CPU at any size, if the
+    radius is the spacing of the points: a query takes as long as the fullest of the
+    cells around it. Ties go to any of the closest points.
+
+    Attributes:
+        radius: farther targets are called invalid by `query`, and `lookup` may find
+            another one than the closest. As asked or wider.
+        coarse: the table that answers there.
+    """
+
+    points: Float[Array, "m d"]
+    mask: Bool[Array, " m"]
+    radius: Scalar
+    coarse: VoxelTable
+    rows: Int[Array, " m"]
+    ordered: Float[Array, "d m"]
+    start: Int[Array, " buckets"]
+    origin: Float[Array, " d"]
+
+    @classmethod
+    def build(
+        cls,
+        points: Points,
+        mask: Mask | None = None,
+        *,
+        radius: Scalar | float | None = None,
+    ) -> "CellGrid":
+        """Sorts the points by bucket and fills the table.
+
+        Args:
+            points: `(m, d)` target points.
+            mask: `(m,)` True for valid points; those that are not finite are not.
+            radius: within which the closest point is found, in the unit of the points;
+                their spacing by default.
+        """
+        m, d = points.shape
+        finite = jnp.all(jnp.isfinite(points), axis=1)
+        mask = finite if mask is None else mask & finite
+        frozen = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
+        if radius is None:
+            radius = median_spacing(frozen, mask)
+        radius = lax.stop_gradient(jnp.asarray(radius, points.dtype))
+        origin, width = _grid(frozen, mask, 2 * _SLACK * radius)
+        home = _cell_of(frozen.T, origin, width, _resolution(m, d))
+        cells = _resolution(m, d) ** d
+        home = jnp.where(mask, home, cells)
+        rows = rows_in_order(home, cells.bit_length())
+        count = jnp.zeros(cells, jnp.int32).at[home].add(1, mode="drop")
+        start = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(count)])
+        ordered = frozen[rows]
+        coarse = VoxelTable.build(ordered, mask[rows], resolution=_RESOLUTION[d])
+        radius = width / (2 * _SLACK)
+        return cls(points, mask, radius, coarse, rows, ordered.T, start, origin)
+
+    def lookup(
+        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
+    ) -> Int[Array, " n"]:
+        """The closest valid target of each query, if it lies within the radius."""
+        d, n = columns.shape
+        columns = lax.stop_gradient(columns)
+        tile = min(_TILE, n)
+        padded = jnp.pad(columns, ((0, 0), (0, -n % tile)), mode="edge")
+        tiles = jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
+        axes = list(self.ordered)  # copies: here, not in the loop
+        found = map_first(lambda tile: self._of_tile(tile, axes), tiles, num)
+        return self.rows[found.reshape(-1)[:n]]
+
+    def lookup_staged(
+        self,
+        columns: Float[Array, "d n"],
+        coarse: Bool[Array, ""],
+        num: Int[Array, ""] | None = None,
+    ) -> Int[Array, " n"]:
+        """Where `coarse` is True the answers of the table alone."""
+        return lax.cond(
+            coarse,
+            lambda columns: self.rows[self.coarse.lookup(columns)],
+            lambda columns: self.lookup(columns, num),
+            lax.stop_gradient(columns),
+        )
+
+    def query(
+        self, points: Points, k: int = 1, radius: Scalar | float | None = None
+    ) -> Neighbours:
+        """As of any index, and not beyond its own radius."""
+        if radius is None:
+            return super().query(points, k, self.radius)
+        return super().query(points, k, jnp.minimum(radius, self.radius))
+
+    def _of_tile(
+        self, queries: Float[Array, "d t"], axes: list[Float[Array, " m"]]
+    ) -> Int[Array, " t"]:
+        """Rows among the ordered points."""
+        (m, d), width = self.points.shape, 2 * _SLACK * self.radius
+        size = _resolution(m, d)
+        # The lower of the two cells along each axis.
+        below = queries - width / 2
+        corner = _cell_of(below, self.origin, width, size, last=size - 2)
+        first, last = [], []
+        for steps in itertools.product((0, 1), repeat=d - 1):
+            offset = sum(s * size ** (axis + 1) for axis, s in enumerate(steps))
+            first.append(self.start[corner + offset])
+            last.append(self.start[corner + offset + 2] - 1)
+        longest = jnp.max(jnp.stack(last) - jnp.stack(first))
+
+        def sq_distance(row: Array) -> Array:
+            sq = (axes[0][row] - queries[0]) ** 2
+            for axis in range(1, d):
+                sq = sq + (axes[axis][row] - queries[axis]) ** 2
+            return sq
+
+        def look(state: tuple[Array, Array]) -> tuple[Array, Array]:
+            at, row = state
+            # Of two values that a loop carries XLA on CPU computes each by itself: the
+            # distance of the best so far is cheaper to compute again than to carry.
+            best = sq_distance(row)
+            for offset in range(_UNROLL):
+                for begin, end in zip(first, last, strict=True):
+                    # Behind the end of its run: the end again, harmless.
+                    other = jnp.maximum(jnp.minimum(begin + at + offset, end), 0)
+                    sq = sq_distance(other)
+                    row = jnp.where(sq < best, other, row)
+                    best = jnp.minimum(sq, best)
+            return at + _UNROLL, row
+
+        start = (jnp.zeros((), jnp.int32), self.coarse.lookup(queries))
+        return lax.while_loop(lambda state: state[0] <= longest, look, start)[1]
+
+
+def _resolution(num_points: int, d: int) -> int:
+    """Cells along each axis, about as wide as two spacings of a surface (a curve)."""
+    if d == 2:
+        return min(max(num_points // 4, 16), 512)
+    return min(max(8 * -(-math.isqrt(num_points) // 16), 8), 128)
+
+
+def _grid(points: Array, mask: Array, width: Scalar) -> tuple[Array, Scalar]:
+    """Lowest corner and width of the cells, no less than asked."""
+    m, d = points.shape
+    some, use = spread_rows(mask, _SAMPLES)
+    sample = jnp.where(use[:, None], points[some], jnp.nan)
+    centre = jnp.nanmedian(sample, axis=0)
+    reach = _REACH * jnp.nanmedian(jnp.max(jnp.abs(sample - centre), axis=1))
+    low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(mask[:, None], points, -jnp.inf), axis=0)
+    low, high = jnp.maximum(low, centre - reach), jnp.minimum(high, centre + reach)
+    width = jnp.maximum(width, jnp.max(high - low) / (_resolution(m, d) - 1))
+    width = jnp.where(width > 0, width, 1)  # not for NaN either, where none is valid
+    return jnp.nan_to_num(low - width / 4), width
+
+
+def _cell_of(
+    columns: Float[Array, "d n"],
+    origin: Array,
+    width: Scalar,
+    size: int,
+    last: int | None = None,
+) -> Int[Array, " n"]:
+    """The cells of points, counted along the first axis first; the border's outside."""
+    flat = jnp.zeros(columns.shape[1:], jnp.int32)
+    for axis in range(columns.shape[0]):
+        at = (columns[axis] - origin[axis]) / width
+        at = jnp.clip(at, 0, size - 1 if last is None else last)
+        flat = flat + at.astype(jnp.int32) * size**axis
+    return flat
