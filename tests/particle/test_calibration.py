@@ -85,7 +85,7 @@ def test_a_region_against_scipy():
     image = T[:3, :3] @ centroid + T[:3, 3] + error[:3]
     true[:3, 3] = image - true[:3, :3] @ centroid
     level = chi2.cdf(error @ np.linalg.solve(covariance, error), 6)
-    for probability in (level - 0.02, level + 0.02):
+    for probability in (float(level) - 0.02, float(level) + 0.02):
         found = modes.contains(jnp.asarray(true), jnp.asarray(centroid), probability)
         assert bool(found) == (probability > level)
     # The second mode is in the region only where the first does not suffice.
