@@ -1,6 +1,7 @@
 """The picture of an experiment: one trial before and after each of a few methods."""
 
 import io
+import textwrap
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,7 +43,8 @@ def trial_figure(
         dot = 3.0 if flat else 9.0 if len(target) < 1000 else 2.5
         axis.scatter(*before.T, s=dot, color=_TARGET, linewidths=0)
         axis.scatter(*here.T, s=1.6 * dot, color=_SOURCE, linewidths=0)
-        axis.set_title(panel.title, fontsize=9)
+        title = textwrap.fill(panel.title, 64 if flat else 36)
+        axis.set_title(title, fontsize=9)
         axis.set_xlim(low[0] - margin, high[0] + margin)
         axis.set_ylim(low[1] - margin, high[1] + margin)
         axis.set_aspect("equal")
