@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import motion, move
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -34,7 +34,7 @@ def _trials(num: int, noise: float):
     for i in range(num):
         rng = np.random.default_rng(i)
         clouds = [_lump(rng, (1, 3, 5, 6)[i % 4]) for _ in range(2)]
-        spacing = np.median(cKDTree(clouds[0]).query(clouds[0], 5)[0][:, -1])
+        spacing = np.median(KDTree(clouds[0]).query(clouds[0], 5)[0][:, -1])
         clouds = [x + noise * spacing * rng.normal(size=x.shape) for x in clouds]
         T = motion(i, 3)
         sources.append(clouds[0])
