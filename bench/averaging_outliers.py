@@ -28,7 +28,7 @@ from jaxreg.averaging import (
     average,
 )
 from jaxreg.averaging.base import length_scale
-from jaxreg.averaging.consensus import agreement
+from jaxreg.averaging.evidence import agreement
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import (
     rotation_errors,

@@ -1,4 +1,4 @@
-"""A robust start from the motions alone: the best of many paths through the graph."""
+"""A robust start from the motions alone: the best of many trees through the graph."""
 
 from typing import NamedTuple
 
@@ -15,22 +15,31 @@ from jaxreg.averaging.base import (
     solution,
 )
 from jaxreg.averaging.cycles import edge_log_odds, judged
+from jaxreg.averaging.evidence import agreement, coherence, squared_errors
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
 
 
-_SCALES = tuple(0.5 / 2**k for k in range(8))
 _AGREES = 0.1
+# Odds are perturbed by factors, which exchange safe edges, and by terms, which exchange
+# doubtful ones; agreement with the best so far adds to them.
+_FACTOR, _TERM, _TOWARD_BEST = 1.0, 2.0, 10.0
+# The search ends after so many rounds without a better hypothesis.
+_PATIENCE = 6
 
 
 class CycleConsensus(AbstractAverager):
-    """Chains motions along edges that close cycles, and keeps the best agreed chain.
+    """Chains motions along edges that close cycles, and keeps the best tree.
 
-    Each edge gets log odds from its 3-cycles (`edge_log_odds`). Every frame is reached
-    by its most probable path from frame 0. If the result contradicts believed edges,
-    or some frame is reached by doubtful edges alone, further hypotheses are drawn with
-    randomly perturbed odds, round by round around the best so far, and scored by how
-    many edges agree with them on a ladder of scales, so no noise level is needed.
+    Each edge gets log odds from its 3-cycles at several scales (`edge_log_odds`), and
+    each scale the tree of greatest odds. If the best contradicts believed edges, or
+    some frame is reached by doubtful edges alone, further trees are drawn with randomly
+    perturbed odds, round by round around the best so far. Trees are compared by how
+    well frames agree with those next to them (`coherence`), over a ladder of scales:
+    no noise level is needed.
+
+    Graphs too large for cycles get the better of the tree of greatest prior weight and
+    the one of shortest paths, by the number of edges that agree.
 
     `init` is ignored. Without `key` a fixed stream of random numbers is used.
 
@@ -41,8 +50,8 @@ class CycleConsensus(AbstractAverager):
     Gradients: none (the start is cut).
     """
 
-    hypotheses: int = eqx.field(static=True, default=16)
-    rounds: int = eqx.field(static=True, default=6)
+    hypotheses: int = eqx.field(static=True, default=32)
+    rounds: int = eqx.field(static=True, default=12)
 
     def __check_init__(self) -> None:
         for name in ("hypotheses", "rounds"):
@@ -57,48 +66,52 @@ class CycleConsensus(AbstractAverager):
     ) -> AveragingSolution:
         """Finds a start for a prepared graph; `edge_weight` is the belief in edges."""
         graph = jax.lax.stop_gradient(graph)
+        if not judged(graph):
+            return solution(graph, _without_cycles(graph), num_steps=0)
         scale, odds = length_scale(graph), edge_log_odds(graph)
-        first = _chain(graph, odds)
-        score = agreement(graph, first, scale)
-        # Prior weights are evidence too: the heaviest tree is a hypothesis of its own.
-        tree = trees.maximum_spanning_tree(
-            graph.edges, graph.T_i_j, graph.weight, graph.num_poses
-        ).T_world_i
-        tree_score = agreement(graph, tree, scale)
-        first = jnp.where(tree_score > score, tree, first)
+        T = jax.vmap(lambda o: _tree(graph, o))(odds)
+        # Prior weights and short chains are hypotheses of their own.
+        T = jnp.concatenate([T, jnp.stack([_heaviest(graph), _shortest(graph, odds)])])
+        score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
+        best = jnp.argmax(score)
+        own = odds[jnp.minimum(best, odds.shape[0] - 1)]
         start = _Search(
-            T=first,
-            score=jnp.maximum(score, tree_score),
-            # Without cycles there is no belief to draw hypotheses by.
-            settled=_is_settled(graph, odds, first, scale) | (not judged(graph)),
+            T=T[best],
+            score=score[best],
+            settled=_is_settled(graph, own, T[best], scale),
+            idle=jnp.asarray(0, jnp.int32),
             round=jnp.asarray(0, jnp.int32),
             key=jax.random.key(0) if key is None else key,
         )
 
+        def unfinished(s: _Search) -> Array:
+            return ~s.settled & (s.round < self.rounds) & (s.idle < _PATIENCE)
+
         def step(s: _Search) -> _Search:
             return self._round(graph, odds, scale, s)
 
-        end = jax.lax.while_loop(
-            lambda s: ~s.settled & (s.round < self.rounds), step, start
-        )
-        belief = jnp.where(graph.weight > 0, jax.nn.sigmoid(odds), 0)
+        end = jax.lax.while_loop(unfinished, step, start)
+        belief = jnp.where(graph.weight > 0, jax.nn.sigmoid(own), 0)
         return solution(graph, end.T, edge_weight=belief, num_steps=end.round)
 
     def _round(
         self, graph: PoseGraph, odds: Array, scale: Array, s: "_Search"
     ) -> "_Search":
         key, now = jax.random.split(s.key)
-        shape = (self.hypotheses, graph.num_edges)
-        noise = 2 * jax.random.logistic(now, shape, odds.dtype)
-        toward_best = 3 * _agrees(graph, s.T, scale)
-        T = jax.vmap(lambda n: _chain(graph, odds + toward_best + n))(noise)
-        score = jax.vmap(lambda T: agreement(graph, T, scale))(T)
+        shape = (2, self.hypotheses, graph.num_edges)
+        noise = jax.random.logistic(now, shape, odds.dtype)
+        each = odds[jnp.arange(self.hypotheses) % odds.shape[0]]
+        each = jnp.exp(_FACTOR * noise[0]) * each + _TERM * noise[1]
+        each = each + _TOWARD_BEST * _agrees(graph, s.T, scale)
+        T = jax.vmap(lambda o: _tree(graph, o))(each)
+        score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
         best = jnp.argmax(score)
         better = score[best] > s.score
         return _Search(
             T=jnp.where(better, T[best], s.T),
             score=jnp.maximum(score[best], s.score),
             settled=s.settled,
+            idle=jnp.where(better, 0, s.idle + 1),
             round=s.round + 1,
             key=key,
         )
@@ -108,49 +121,47 @@ class _Search(NamedTuple):
     T: Array
     score: Array
     settled: Array
+    idle: Array  # rounds since the last gain
     round: Array
     key: Array
 
 
-def _chain(graph: PoseGraph, odds: Array) -> Array:
-    """Poses along the most probable path from frame 0 to each frame."""
-    doubt = jnp.clip(jax.nn.softplus(-odds), 0.01, 10)  # -log of the belief
+def _tree(graph: PoseGraph, odds: Array) -> Array:
+    """Poses along the tree of greatest odds: no path has a safer weakest edge."""
+    present = graph.weight > 0
+    low = jnp.min(jnp.where(present, odds, jnp.inf))
+    weight = jnp.where(present, odds - low + 1, 0)
+    return trees.maximum_spanning_tree(
+        graph.edges, graph.T_i_j, weight, graph.num_poses
+    ).T_world_i
+
+
+def _heaviest(graph: PoseGraph) -> Array:
+    return trees.maximum_spanning_tree(
+        graph.edges, graph.T_i_j, graph.weight, graph.num_poses
+    ).T_world_i
+
+
+def _shortest(graph: PoseGraph, odds: Array) -> Array:
+    """Poses along the most probable path from frame 0 to each frame, coarsest odds."""
+    doubt = jnp.clip(jax.nn.softplus(-odds[0]), 0.01, 10)  # -log of the belief
     weight = jnp.where(graph.weight > 0, 1 / doubt, 0)
     return trees.shortest_path_poses(graph.edges, graph.T_i_j, weight, graph.num_poses)[
         0
     ]
 
 
-def agreement(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
-    """Edges that agree, by prior weight, summed over a ladder of kernel widths."""
-    rotation, translation = graph.differences(T_world_i)
-    sq = rotation / 2 + translation / scale**2
-    total = jnp.zeros((), sq.dtype)
-    for width in _SCALES:
-        total = total + jnp.sum(graph.weight * jnp.exp(-sq / (2 * width**2)))
-    return total
-
-
-def redundancy(graph: PoseGraph, T_world_i: Array) -> Array:
-    """Edges that agree beyond those that any tree agrees with, over the same ladder.
-
-    A chain of motions agrees with its own edges, however far it drifts.
-    """
-    rotation, translation = graph.differences(T_world_i)
-    sq = rotation / 2 + translation / length_scale(graph) ** 2
-    present = graph.weight > 0
-    usual = jnp.sum(graph.weight) / jnp.maximum(jnp.sum(present), 1)
-    free = (graph.num_poses - 1) * usual
-    total = jnp.zeros((), sq.dtype)
-    for width in _SCALES:
-        agreed = jnp.sum(graph.weight * jnp.exp(-sq / (2 * width**2)))
-        total = total + jnp.maximum(agreed - free, 0)
-    return total
+def _without_cycles(graph: PoseGraph) -> Array:
+    heaviest, scale = _heaviest(graph), length_scale(graph)
+    paths = trees.shortest_path_poses(
+        graph.edges, graph.T_i_j, graph.weight, graph.num_poses
+    )[0]
+    better = agreement(graph, paths, scale) >= agreement(graph, heaviest, scale)
+    return jnp.where(better, paths, heaviest)
 
 
 def _agrees(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
-    rotation, translation = graph.differences(T_world_i)
-    return jnp.exp(-(rotation / 2 + translation / scale**2) / (2 * _AGREES**2))
+    return jnp.exp(-squared_errors(graph, T_world_i, scale) / (2 * _AGREES**2))
 
 
 def _is_settled(graph: PoseGraph, odds: Array, T: Array, scale: Array) -> Array:

@@ -21,7 +21,8 @@ from jaxreg.averaging.base import (
     solution,
     weighted_mean,
 )
-from jaxreg.averaging.consensus import CycleConsensus, redundancy
+from jaxreg.averaging.consensus import CycleConsensus
+from jaxreg.averaging.evidence import redundancy
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, gauss_newton_step
 from jaxreg.averaging.graduated import graduated
 from jaxreg.averaging.iterate import (

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg.averaging.base import length_scale, masked_quantile
-from jaxreg.averaging.consensus import redundancy
+from jaxreg.averaging.evidence import redundancy
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, precisions
 from jaxreg.averaging.iterate import Iterated
 from jaxreg.averaging.posegraph_lm import (

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg.averaging.base import length_scale, masked_quantile
+from jaxreg.averaging.evidence import SCALES, redundancies
 from jaxreg.graph.pose_graph import PoseGraph
 
 
@@ -15,7 +16,6 @@ _INSIDE = 0.05
 #: Medians of chi-squared laws by their degrees of freedom.
 CHI2_MEDIAN = {1: 0.4549, 2: 1.3863, 3: 2.3660, 6: 5.3481}
 _NARROWEST_STEP = 0.5
-_WIDEST_START = 0.3
 
 
 def gaussian_trust(
@@ -30,19 +30,16 @@ def gaussian_trust(
 def first_width(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"]
 ) -> Float[Array, "2"]:
-    """A width that sees the right edges from the start.
+    """A width that sees the right edges from the start, and few others.
 
-    Twice the lower quartile of the residuals that the start leaves (the edges of its
-    tree leave none), for starts that drift, and at least 0.3 rad and length scales.
+    Four times the scale at which the edges that agree, beyond those of a tree, say
+    most: fine agreement says more than coarse. Wrong motions that agree with each
+    other roughly draw a start to themselves under a wider kernel.
     """
-    scale = length_scale(graph)
-    rotation, translation = graph.differences(T_world_i)
-    sq = rotation / 2 + translation / scale**2
-    eps = 1e-4 if sq.dtype == jnp.float32 else 1e-8
-    open_edges = (graph.weight > 0) & (sq > eps**2)
-    low = jnp.sqrt(masked_quantile(sq, open_edges, 0.25))
-    width = jnp.maximum(2 * low, _WIDEST_START)
-    return jnp.stack([width * scale, width])
+    found = redundancies(graph, T_world_i)
+    rank = jnp.arange(1, len(SCALES) + 1, dtype=found.dtype)
+    width = 4 * jnp.asarray(SCALES, found.dtype)[jnp.argmax(rank * found)]
+    return jnp.stack([width * length_scale(graph), width])
 
 
 def annealed_width(
