@@ -32,11 +32,11 @@ class CycleConsensus(AbstractAverager):
     """Chains motions along edges that close cycles, and keeps the best tree.
 
     Each edge gets log odds from its 3-cycles at several scales (`edge_log_odds`), and
-    each scale the tree of greatest odds and the most probable paths. If the best
-    contradicts believed edges, or some frame is reached by doubtful edges alone,
-    further ones are drawn with randomly perturbed odds, round by round around the best
-    so far. They are compared by how well frames agree with those next to them
-    (`coherence`), over a ladder of scales: no noise level is needed.
+    each scale the tree of greatest odds. If the best contradicts believed edges, or
+    some frame is reached by doubtful edges alone, further trees are drawn with randomly
+    perturbed odds, round by round around the best so far. Trees are compared by how
+    well frames agree with those next to them (`coherence`), over a ladder of scales:
+    no noise level is needed.
 
     Graphs too large for cycles get the better of the tree of greatest prior weight and
     the one of shortest paths, by the number of edges that agree.
@@ -44,13 +44,13 @@ class CycleConsensus(AbstractAverager):
     `init` is ignored. Without `key` a fixed stream of random numbers is used.
 
     Attributes:
-        hypotheses: perturbed odds in each round, under one vmap (static).
+        hypotheses: drawn in each round, under one vmap (static).
         rounds: the largest number of rounds (static).
 
     Gradients: none (the start is cut).
     """
 
-    hypotheses: int = eqx.field(static=True, default=16)
+    hypotheses: int = eqx.field(static=True, default=32)
     rounds: int = eqx.field(static=True, default=12)
 
     def __check_init__(self) -> None:
@@ -69,11 +69,12 @@ class CycleConsensus(AbstractAverager):
         if not judged(graph):
             return solution(graph, _without_cycles(graph), num_steps=0)
         scale, odds = length_scale(graph), edge_log_odds(graph)
-        # Prior weights are evidence too: the heaviest tree is a hypothesis of its own.
-        T = jnp.concatenate([_hypotheses(graph, odds), _heaviest(graph)[None]])
+        T = jax.vmap(lambda o: _tree(graph, o))(odds)
+        # Prior weights and short chains are hypotheses of their own.
+        T = jnp.concatenate([T, jnp.stack([_heaviest(graph), _shortest(graph, odds)])])
         score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
         best = jnp.argmax(score)
-        own = odds[best % odds.shape[0]]
+        own = odds[jnp.minimum(best, odds.shape[0] - 1)]
         start = _Search(
             T=T[best],
             score=score[best],
@@ -102,7 +103,7 @@ class CycleConsensus(AbstractAverager):
         each = odds[jnp.arange(self.hypotheses) % odds.shape[0]]
         each = jnp.exp(_FACTOR * noise[0]) * each + _TERM * noise[1]
         each = each + _TOWARD_BEST * _agrees(graph, s.T, scale)
-        T = _hypotheses(graph, each)
+        T = jax.vmap(lambda o: _tree(graph, o))(each)
         score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
         best = jnp.argmax(score)
         better = score[best] > s.score
@@ -135,16 +136,6 @@ def _tree(graph: PoseGraph, odds: Array) -> Array:
     ).T_world_i
 
 
-def _hypotheses(graph: PoseGraph, odds: Array) -> Float[Array, "h v D D"]:
-    """Poses along the safest tree and along the shortest paths, for each row of odds.
-
-    Trees avoid wrong edges best, but are long and drift; paths are short.
-    """
-    safe = jax.vmap(lambda o: _tree(graph, o))(odds)
-    short = jax.vmap(lambda o: _shortest(graph, o))(odds)
-    return jnp.concatenate([safe, short])
-
-
 def _heaviest(graph: PoseGraph) -> Array:
     return trees.maximum_spanning_tree(
         graph.edges, graph.T_i_j, graph.weight, graph.num_poses
@@ -152,8 +143,8 @@ def _heaviest(graph: PoseGraph) -> Array:
 
 
 def _shortest(graph: PoseGraph, odds: Array) -> Array:
-    """Poses along the most probable path from frame 0 to each frame."""
-    doubt = jnp.clip(jax.nn.softplus(-odds), 0.01, 10)  # -log of the belief
+    """Poses along the most probable path from frame 0 to each frame, coarsest odds."""
+    doubt = jnp.clip(jax.nn.softplus(-odds[0]), 0.01, 10)  # -log of the belief
     weight = jnp.where(graph.weight > 0, 1 / doubt, 0)
     return trees.shortest_path_poses(graph.edges, graph.T_i_j, weight, graph.num_poses)[
         0
