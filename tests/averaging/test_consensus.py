@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.averaging import CycleConsensus, average
-from jaxreg.averaging.cycles import NEUTRAL, edge_log_odds
+from jaxreg.averaging.cycles import NEUTRAL, edge_log_odds, judged
 from jaxreg.averaging.evidence import coherence
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_errors
@@ -63,6 +63,23 @@ def test_beliefs_ignore_masked_edges_and_know_parallel_ones():
     odds = np.asarray(log_odds(single(X, again, motions, mask=mask)))
     assert (odds[:, 50] == -np.inf).all()
     np.testing.assert_allclose(odds[:, H:], odds[:, :5], rtol=1e-3, atol=1e-3)
+
+
+def test_graphs_too_large_for_cycles_take_short_paths_or_the_heaviest_tree():
+    num = 1100
+    rng = np.random.default_rng(0)
+    X = np.tile(np.eye(4), (num, 1, 1))
+    X[1:, :3, :3] = Rotation.from_rotvec(rng.normal(size=(num - 1, 3))).as_matrix()
+    X[1:, :3, 3] = rng.normal(size=(num - 1, 3))
+    # Every frame is seen from the first, and wrongly, so the weights say, from before.
+    to = np.arange(1, num)
+    edges = np.concatenate([np.stack([0 * to, to], 1), np.stack([to - 1, to], 1)[1:]])
+    T = np.concatenate([X[1:], np.tile(np.eye(4), (num - 2, 1, 1))])
+    weight = np.where(np.arange(len(edges)) < num - 1, 1.0, 0.1).astype(np.float32)
+    graph = single(X, edges, T, weight=weight)
+    assert not judged(graph)
+    found = average(graph, CycleConsensus()).T_world_i
+    np.testing.assert_allclose(found, X, atol=1e-4)
 
 
 def test_coherence_against_a_loop_over_frames():
