@@ -26,7 +26,7 @@ from jaxreg.neighbours.voxel_table import VoxelTable
 
 _TILE = 512
 _UNROLL = 2
-# Of the table, filled in half a millisecond on one core of a CPU.
+# Of the table: small, as it is filled for every registration.
 _RESOLUTION = {2: 64, 3: 16}
 # Cells are this much wider than two radii, for the rounding of coordinates.
 _SLACK = 1.01
@@ -37,11 +37,11 @@ _REACH = 4
 
 
 class CellGrid(AbstractIndex):
-    """Exact within a radius, from a hundred to a million targets; O(n + m) memory.
+    """Exact within a radius; O(n + m) memory and at most 8 MB of cells.
 
-    Five to seven million queries a second on one core of a CPU at any size, if the
-    radius is the spacing of the points: a query takes as long as the fullest of the
-    cells around it. Ties go to any of the closest points.
+    Some six million queries a second on one core of a CPU, of 1,000 to 100,000 targets,
+    if the radius is their spacing: a query takes as long as the fullest of the cells
+    around it. Ties go to any of the closest points.
 
     Attributes:
         radius: farther targets are called invalid by `query`, and `lookup` may find
@@ -55,7 +55,7 @@ class CellGrid(AbstractIndex):
     coarse: VoxelTable
     rows: Int[Array, " m"]
     ordered: Float[Array, "d m"]
-    start: Int[Array, " buckets"]
+    start: Int[Array, " cells"]
     origin: Float[Array, " d"]
 
     @classmethod
@@ -66,7 +66,7 @@ class CellGrid(AbstractIndex):
         *,
         radius: Scalar | float | None = None,
     ) -> "CellGrid":
-        """Sorts the points by bucket and fills the table.
+        """Sorts the points by cell and fills the table.
 
         Args:
             points: `(m, d)` target points.
