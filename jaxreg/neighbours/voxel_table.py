@@ -20,7 +20,7 @@ cell and rarely more than one (R < r_1); the bound above holds there too.
 On the bench's surface in 64^3 cells, queries near the surface, with K = 1 / 2 / 4 / 8:
 mean excess 0.06 / 0.005 / 0 / 0 cells at 1,000 targets, 0.19 / 0.10 / 0.03 / 0.001 at
 10,000, 0.25 / 0.20 / 0.15 / 0.09 at 100,000; exact answers 82 / 98 / 100 / 100 %,
-33 / 55 / 83 / 99 % and 6 / 11 / 19 / 34 %.
+33 / 55 / 83 / 98 % and 6 / 11 / 19 / 34 % (K = 2 and 4 before the coarse grid).
 """
 
 import equinox as eqx
