@@ -20,8 +20,8 @@ from jaxreg.graph.pose_graph import PoseGraph
 
 #: Cycles are tried for at most this many edges times frames.
 CYCLE_LIMIT = 1_000_000
-# Chosen on synthetic graphs and, as `NEUTRAL`, on the scenes of `evidence.py`: the share
-# of right edges, the power of the density, the least and the largest ratio, the rounds.
+# Chosen on synthetic graphs and, as `NEUTRAL`, on the scenes of `evidence.py`: share of
+# right edges, power of the density, least and largest ratio, and rounds.
 _PRIOR, _POWER, _LEAST, _CAP, _ROUNDS = 0.4, 4, 0.3, 1e4, 6
 #: Closing errors, in radians and length scales, that speak neither for nor against.
 NEUTRAL = (0.2, 0.1, 0.05, 0.025)
