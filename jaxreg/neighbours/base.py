@@ -107,6 +107,14 @@ class AbstractIndex(eqx.Module):
         return Neighbours(index, jnp.where(found, sq, jnp.inf) if k > 1 else sq, valid)
 
 
+def in_tiles(columns: Float[Array, "d n"], most: int) -> Float[Array, "a d t"]:
+    """Tiles of at most so many queries, the last filled up with the last query."""
+    d, n = columns.shape
+    tile = min(most, n)
+    padded = jnp.pad(columns, ((0, 0), (0, -n % tile)), mode="edge")
+    return jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
+
+
 def map_first(
     find: Callable[[Array], Array],
     tiles: Float[Array, "a d t"],

@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Mask, Points, Scalar
-from jaxreg.neighbours.base import AbstractIndex, Neighbours, map_first
+from jaxreg.neighbours.base import AbstractIndex, Neighbours, in_tiles, map_first
 from jaxreg.neighbours.order import hilbert_order
 
 
@@ -107,14 +107,11 @@ class BoxTree(AbstractIndex):
         return jax.tree.map(lambda x: x[place], found)
 
     def _tiles(self, columns: Float[Array, "d n"]) -> Float[Array, "a d t"]:
-        d, n = columns.shape
         columns = lax.stop_gradient(columns)
         # A query that is not finite would spoil the bounds of its tile.
         finite = jnp.all(jnp.isfinite(columns), axis=0)
         columns = jnp.where(finite, columns, self.leaf_points[0, :, :1])
-        tile = min(_TILE, n)
-        padded = jnp.pad(columns, ((0, 0), (0, -n % tile)), mode="edge")
-        return jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
+        return in_tiles(columns, _TILE)
 
     def _leaf_of_tile(self, queries: Float[Array, "d t"]) -> Int[Array, " t"]:
         """The leaf that holds the closest point of each query."""

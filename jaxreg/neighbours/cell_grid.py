@@ -20,7 +20,7 @@ from jaxreg._core.padding import spread_rows
 from jaxreg._core.sorting import rows_in_order
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.geometry.spacing import median_spacing
-from jaxreg.neighbours.base import AbstractIndex, Neighbours, map_first
+from jaxreg.neighbours.base import AbstractIndex, Neighbours, in_tiles, map_first
 from jaxreg.neighbours.voxel_table import VoxelTable
 
 
@@ -97,11 +97,8 @@ class CellGrid(AbstractIndex):
         self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
     ) -> Int[Array, " n"]:
         """The closest valid target of each query, if it lies within the radius."""
-        d, n = columns.shape
-        columns = lax.stop_gradient(columns)
-        tile = min(_TILE, n)
-        padded = jnp.pad(columns, ((0, 0), (0, -n % tile)), mode="edge")
-        tiles = jnp.swapaxes(padded.reshape(d, -1, tile), 0, 1)
+        n = columns.shape[1]
+        tiles = in_tiles(lax.stop_gradient(columns), _TILE)
         axes = list(self.ordered)  # copies: here, not in the loop
         found = map_first(lambda tile: self._of_tile(tile, axes), tiles, num)
         return self.rows[found.reshape(-1)[:n]]
