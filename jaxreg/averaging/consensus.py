@@ -15,9 +15,16 @@ from jaxreg.averaging.base import (
     solution,
 )
 from jaxreg.averaging.cycles import edge_log_odds, judged
-from jaxreg.averaging.evidence import agreement, coherence, squared_errors
+from jaxreg.averaging.evidence import (
+    agreement,
+    agrees,
+    coherence,
+    squared_errors,
+    votes,
+)
+from jaxreg.geometry import lie
 from jaxreg.graph import trees
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, product
 
 
 _AGREES = 0.1
@@ -34,7 +41,8 @@ class CycleConsensus(AbstractAverager):
     Each edge gets log odds from its 3-cycles at several scales (`edge_log_odds`), and
     each scale the tree of greatest odds. If the best contradicts believed edges, or
     some frame is reached by doubtful edges alone, further trees are drawn with randomly
-    perturbed odds, round by round around the best so far. Trees are compared by how
+    perturbed odds, round by round around the best so far, and the best is changed by
+    moving single frames to where most of their edges put them. All are compared by how
     well frames agree with those next to them (`coherence`), over a ladder of scales:
     no noise level is needed.
 
@@ -102,8 +110,9 @@ class CycleConsensus(AbstractAverager):
         noise = jax.random.logistic(now, shape, odds.dtype)
         each = odds[jnp.arange(self.hypotheses) % odds.shape[0]]
         each = jnp.exp(_FACTOR * noise[0]) * each + _TERM * noise[1]
-        each = each + _TOWARD_BEST * _agrees(graph, s.T, scale)
+        each = each + _TOWARD_BEST * _holds(graph, s.T, scale)
         T = jax.vmap(lambda o: _tree(graph, o))(each)
+        T = jnp.concatenate([T, _moved(graph, s.T, scale, self.hypotheses)])
         score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
         best = jnp.argmax(score)
         better = score[best] > s.score
@@ -136,6 +145,41 @@ def _tree(graph: PoseGraph, odds: Array) -> Array:
     ).T_world_i
 
 
+def _moved(graph: PoseGraph, T: Array, scale: Array, most: int) -> Array:
+    """The poses with one frame moved to where most of its neighbours put it.
+
+    A copy for each of at most `most` frames: those that gain most agreement by it.
+    """
+    num, none = graph.num_poses, 2 * graph.num_edges
+    tail, head = jnp.concatenate([graph.edges, graph.edges[:, ::-1]]).T
+    T_tail_head = jnp.concatenate([graph.T_i_j, lie.inverse(graph.T_i_j)])
+    order = jnp.arange(none, dtype=jnp.int32)
+    vote = jnp.append(jnp.tile(votes(graph), 2), 0)
+    voters = jnp.full((num, num), none, jnp.int32)
+    voters = voters.at[head, tail].min(jnp.where(vote[:-1] > 0, order, none))
+    # Points whose squared distances are the errors between poses.
+    unit = jnp.sqrt(0.5) * jnp.ones_like(T[0, :-1]).at[:, -1].set(jnp.sqrt(2) / scale)
+    put = product(T[tail], T_tail_head)
+    here, there = ((unit * X[:, :-1]).reshape(X.shape[0], -1) for X in (T, put))
+    there = jnp.append(there, there[:1], axis=0)
+
+    def support(x: Array, v: Array) -> Array:
+        """The votes of the neighbours of frame v for placing it at x."""
+        parts = [(there[voters[v], c] - x[:, c, None]) ** 2 for c in range(x.shape[1])]
+        return jnp.sum(
+            vote[voters[v]] * agrees(sum(parts, jnp.zeros((), T.dtype))), axis=1
+        )
+
+    gain = support(there[:-1], head) - support(here, jnp.arange(num))[head]
+    gain = jnp.where((vote[:-1] > 0) & (head > 0), gain, -jnp.inf)
+    best = jnp.full((num,), -jnp.inf, T.dtype).at[head].max(gain)
+    first = jnp.where(gain == best[head], order, none - 1)
+    first = jnp.full((num,), none - 1, jnp.int32).at[head].min(first)
+    gained, frames = jax.lax.top_k(best, min(most, num))
+    moved = jax.vmap(lambda v: T.at[v].set(put[first[v]]))(frames)
+    return jnp.where((gained > 0)[:, None, None, None], moved, T)
+
+
 def _heaviest(graph: PoseGraph) -> Array:
     return trees.maximum_spanning_tree(
         graph.edges, graph.T_i_j, graph.weight, graph.num_poses
@@ -160,7 +204,7 @@ def _without_cycles(graph: PoseGraph) -> Array:
     return jnp.where(better, paths, heaviest)
 
 
-def _agrees(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
+def _holds(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     return jnp.exp(-squared_errors(graph, T_world_i, scale) / (2 * _AGREES**2))
 
 
@@ -170,5 +214,5 @@ def _is_settled(graph: PoseGraph, odds: Array, T: Array, scale: Array) -> Array:
     component = trees.components(graph.edges, believed, graph.num_poses)
     placed = trees.components(graph.edges, graph.weight, graph.num_poses) == 0
     reached = jnp.all((component == 0) | ~placed)
-    doubtful = jnp.sum(believed * (_agrees(graph, T, scale) < 0.5))
+    doubtful = jnp.sum(believed * (_holds(graph, T, scale) < 0.5))
     return reached & (doubtful <= 0.02 * jnp.sum(believed))

@@ -9,11 +9,14 @@ likelihoods that needs no noise level: the density of closing errors of right cy
 taken to fall as a power of the error, as it does if every scale of noise is as likely.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg.averaging.base import length_scale
+from jaxreg.averaging.evidence import prior_odds
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -47,9 +50,7 @@ def edge_log_odds(graph: PoseGraph) -> Float[Array, "s e"]:
     """
     graph = jax.lax.stop_gradient(graph)
     present = graph.weight > 0
-    usual = jnp.sum(graph.weight) / jnp.maximum(jnp.sum(present), 1)
-    relative = jnp.where(present, graph.weight / jnp.where(usual > 0, usual, 1), 1)
-    prior = jnp.log(relative * (_PRIOR / (1 - _PRIOR)))
+    prior = prior_odds(graph) + math.log(_PRIOR / (1 - _PRIOR))
     error, closed, via_i, via_j = _cycles(graph)
     pad = ((0, 0), (0, -graph.num_poses % _TOGETHER))
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.base import length_scale, weighted_mean
+from jaxreg.averaging.base import length_scale, masked_quantile, weighted_mean
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 
@@ -15,6 +15,8 @@ SCALES = tuple(0.5 / 2**k for k in range(8))
 # with, and what they count in dense graphs. Chosen on all 33 scenes of
 # learning2sync_relative_poses and on synthetic graphs: none was held out.
 _COARSE, _NEIGHBOURS, _NEAR = (0.4, 0.2, 0.1, 0.05, 0.025), 4, 3.0
+# The log likelihood ratio of agreement; deviations that are put down to chance.
+_AGREEMENT, _CHANCE = 2.0, 2.0
 
 
 def squared_errors(
@@ -25,12 +27,32 @@ def squared_errors(
     return rotation / 2 + translation / scale**2
 
 
+def prior_odds(graph: PoseGraph) -> Float[Array, " e"]:
+    """The logarithm of each prior weight over the middle one; 0 for absent edges.
+
+    A weight says how much likelier than usual an edge is right.
+    """
+    present = graph.weight > 0
+    usual = masked_quantile(graph.weight, present, 0.5)
+    return jnp.log(jnp.where(present, graph.weight / jnp.where(usual > 0, usual, 1), 1))
+
+
+def votes(graph: PoseGraph) -> Float[Array, " e"]:
+    """What agreement with each edge counts: its log odds, in those of a usual edge.
+
+    By Bayes' rule agreement is worth the logarithm of the likelihood ratio plus that of
+    the prior odds: weights count by their logarithm. 0 for absent edges.
+    """
+    count = jnp.maximum(1 + prior_odds(graph) / _AGREEMENT, 0.1)
+    return jnp.where(graph.weight > 0, count, 0)
+
+
 def agreement(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
-    """Edges that agree, by prior weight, summed over the ladder of scales."""
-    sq = squared_errors(graph, T_world_i, scale)
+    """Edges that agree, by `votes`, summed over the ladder of scales."""
+    sq, count = squared_errors(graph, T_world_i, scale), votes(graph)
     total = jnp.zeros((), sq.dtype)
     for width in SCALES:
-        total = total + jnp.sum(graph.weight * jnp.exp(-sq / (2 * width**2)))
+        total = total + jnp.sum(count * jnp.exp(-sq / (2 * width**2)))
     return total
 
 
@@ -39,17 +61,22 @@ def redundancies(graph: PoseGraph, T_world_i: Array) -> Float[Array, " s"]:
 
     A chain of motions agrees with its own edges, however far it drifts.
     """
-    sq = squared_errors(graph, T_world_i, length_scale(graph))
-    present = graph.weight > 0
-    usual = jnp.sum(graph.weight) / jnp.maximum(jnp.sum(present), 1)
+    sq, count = squared_errors(graph, T_world_i, length_scale(graph)), votes(graph)
+    usual = jnp.sum(count) / jnp.maximum(jnp.sum(count > 0), 1)
     free = (graph.num_poses - 1) * usual
-    agreed = [jnp.sum(graph.weight * jnp.exp(-sq / (2 * w**2))) for w in SCALES]
+    agreed = [jnp.sum(count * jnp.exp(-sq / (2 * w**2))) for w in SCALES]
     return jnp.maximum(jnp.stack(agreed) - free, 0)
 
 
 def redundancy(graph: PoseGraph, T_world_i: Array) -> Array:
     """The sum of `redundancies`."""
     return jnp.sum(redundancies(graph, T_world_i))
+
+
+def agrees(sq: Array) -> Array:
+    """How far errors of these squares are agreement: 1 to 0, over coarse scales."""
+    parts = [1 / (1 + (sq / w**2) ** 2) for w in _COARSE]
+    return jnp.mean(jnp.stack(parts), axis=0)
 
 
 def coherence(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
@@ -60,11 +87,12 @@ def coherence(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     numbers than the right motions. Poses that follow them put frames beside others
     whose motions say otherwise. So: the share of all edges that agree, plus that of the
     edges to the nearest measured neighbours of each frame, which counts the more the
-    fewer of its neighbours those are. Dense over frames.
+    fewer of its neighbours those are, and only so far as it is more than chance would
+    give to as many edges: a search finds what profits by chance. Dense over frames.
     """
     sq = squared_errors(graph, T_world_i, scale)
-    parts = [1 / (1 + (sq / w**2) ** 2) for w in _COARSE]
-    agrees = jnp.mean(jnp.stack(parts), axis=0)
+    count = votes(graph)
+    agreed = agrees(sq)
     i, j, num = graph.edges[:, 0], graph.edges[:, 1], graph.num_poses
     gap = product(lie.inverse(T_world_i)[i], T_world_i[j])
     near = graph.dim - jnp.trace(lie.rotation(gap), axis1=-2, axis2=-1)
@@ -72,17 +100,18 @@ def coherence(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     near = jnp.where(graph.weight > 0, near, jnp.inf)
     distance = jnp.full((num, num), jnp.inf, sq.dtype)
     distance = distance.at[i, j].min(near).at[j, i].min(near)
-    count = min(_NEIGHBOURS, num)
-    nearest, index = jax.lax.top_k(-distance, count)
+    nearest, index = jax.lax.top_k(-distance, min(_NEIGHBOURS, num))
     frames = jnp.arange(num)[:, None]
 
     def table(x: Array) -> Array:
         dense = jnp.zeros((num, num), sq.dtype).at[i, j].max(x).at[j, i].max(x)
         return jnp.where(jnp.isfinite(nearest), dense[frames, index], 0)
 
-    weight = table(graph.weight)
-    own = weighted_mean(table(graph.weight * agrees), jnp.ones_like(weight))
+    weight, mean = table(count), weighted_mean(agreed, count)
+    own = weighted_mean(table(count * agreed), jnp.ones_like(weight))
     own = own / jnp.maximum(jnp.mean(weight), jnp.finfo(sq.dtype).tiny)
+    chance = jnp.sqrt(mean * (1 - mean) / (0.5 * _NEIGHBOURS * num))
+    own = jnp.maximum(own - _CHANCE * chance, mean)
     degree = 2 * jnp.sum(graph.weight > 0) / num
     select = jnp.maximum(1 - 2 * _NEIGHBOURS / jnp.maximum(degree, 1), 0) ** 3
-    return _NEAR * select * own + weighted_mean(agrees, graph.weight)
+    return _NEAR * select * own + mean
