@@ -40,14 +40,14 @@ def feature_transform(
     """
     if resolution % 2 or resolution <= _COARSEST:
         table = _closest_in_each_cell(in_cells, mask, resolution, candidates)
-        table = _sweep_all(table, in_cells)
+        table = _swept(table, in_cells, 2)
     else:
         half = resolution // 2
         coarse = _closest_in_each_cell(in_cells / 2, mask, half, candidates)
-        coarse = _sweep_all(_sweep_all(coarse, in_cells / 2), in_cells / 2)
+        coarse = _swept(coarse, in_cells / 2, 2)
         table = _closest_in_each_cell(in_cells, mask, resolution, candidates)
-        table = _merge_cells(table, _doubled(coarse), in_cells)
-    return _sweep_all(table, in_cells).reshape(candidates, -1)
+        table = _swept(_merge_cells(table, _doubled(coarse), in_cells), in_cells, 1)
+    return table.reshape(candidates, -1)
 
 
 def _doubled(table: Array) -> Array:
@@ -70,14 +70,6 @@ def _merge_cells(own: Array, other: Array, in_cells: Array) -> Array:
         [jnp.ravel(x) for x in grid],
     )
     return merged.reshape(own.shape)
-
-
-def _sweep_all(table: Array, in_cells: Array) -> Array:
-    """A sweep along each axis in turn."""
-    axes = list(in_cells.T)
-    for axis in range(len(axes)):
-        table = _sweep(table, axes, axis)
-    return table
 
 
 def _closest_in_each_cell(
@@ -104,27 +96,42 @@ def _closest_in_each_cell(
     return found.reshape(candidates, *(resolution,) * d)
 
 
-def _sweep(table: Array, axes: list[Array], axis: int) -> Array:
-    """Carries candidates along one axis, forward then backward."""
+def _swept(table: Array, in_cells: Array, times: int) -> Array:
+    """So many times along each axis in turn, forward then backward.
+
+    Always along the first axis of the grid, after which its axes move on by one, and
+    backward is forward over lines in reverse: a sweep is compiled once.
+    """
     candidates, resolution, *_ = table.shape
     d = table.ndim - 1
-    merge = _closer if candidates == 1 else _merge
-    centres = jnp.arange(resolution, dtype=axes[0].dtype) + 0.5
+    centres = jnp.arange(resolution, dtype=in_cells.dtype) + 0.5
     others = [jnp.ravel(x) for x in jnp.meshgrid(*[centres] * (d - 1), indexing="ij")]
+    merge = _closer if candidates == 1 else _merge
+    lines = jnp.moveaxis(table, 0, 1).reshape(resolution, candidates, -1)
 
-    def step(before: Array, line: tuple[Array, Array]) -> tuple[Array, Array]:
-        coordinate, own = line
-        centre = others[:axis] + [coordinate] + others[axis:]
-        best = merge(own, before, axes, centre)
-        return best, best
+    def along_first(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        lines, columns = state
+        axes = list(columns)
 
-    lines = jnp.moveaxis(table, axis + 1, 0)
-    shape = lines.shape
-    lines = lines.reshape(resolution, candidates, -1)
-    start = jnp.full(lines.shape[1:], -1, table.dtype)
-    lines = lax.scan(step, start, (centres, lines))[1]
-    lines = lax.scan(step, start, (centres, lines), reverse=True)[1]
-    return jnp.moveaxis(lines.reshape(shape), 0, axis + 1)
+        def step(before: Array, line: tuple[Array, Array]) -> tuple[Array, Array]:
+            coordinate, own = line
+            best = merge(own, before, axes, [coordinate, *others])
+            return best, best
+
+        def sweep(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            lines, coordinates = state
+            start = jnp.full(lines.shape[1:], -1, lines.dtype)
+            lines = lax.scan(step, start, (coordinates, lines))[1]
+            return lines[::-1], coordinates[::-1]
+
+        lines = lax.fori_loop(0, 2, sweep, (lines, centres))[0]
+        grid = lines.reshape(resolution, candidates, resolution, -1)
+        grid = jnp.moveaxis(grid, 0, -1)  # (k, second, .., first)
+        lines = jnp.moveaxis(grid, 0, 1).reshape(lines.shape)
+        return lines, jnp.roll(columns, -1, axis=0)
+
+    lines = lax.fori_loop(0, d * times, along_first, (lines, in_cells.T))[0]
+    return jnp.moveaxis(lines, 1, 0).reshape(table.shape)
 
 
 def _sq_distance(row: Array, axes: list[Array], centre: list[Array]) -> Array:
