@@ -1,14 +1,17 @@
 """Fields of method objects: traced numbers, static structure."""
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 
 Tree = TypeVar("Tree")
+Out = TypeVar("Out")
 
 
 def traced(default: float) -> Any:
@@ -33,3 +36,12 @@ def cast_floats(tree: Tree, dtype: Any) -> Tree:
         return x
 
     return jax.tree.map(cast, tree)
+
+
+def on_both(function: Callable[[Tree], Out], a: Tree, b: Tree) -> tuple[Out, Out]:
+    """`function` of either tree; of arrays of the same shapes it is compiled once."""
+    first, second = (jax.tree.map(jax.typeof, tree) for tree in (a, b))
+    if first != second:
+        return function(a), function(b)
+    out = lax.map(function, jax.tree.map(lambda *x: jnp.stack(x), a, b))
+    return jax.tree.map(lambda x: x[0], out), jax.tree.map(lambda x: x[1], out)

@@ -47,7 +47,7 @@ def cell_keys(
     return jnp.where(mask, morton_keys(cells.T), UNUSED)
 
 
-def _num_filled(ordered: Int[Array, " n"], shift: int = 0) -> Int[Array, ""]:
+def _num_filled(ordered: Int[Array, " n"], shift: Int[Array, ""] | int = 0) -> Int[Array, ""]:
     key = ordered >> shift
     new = (key[1:] != key[:-1]) & (ordered[1:] != UNUSED)
     return jnp.sum(new) + (ordered[0] != UNUSED)
@@ -68,7 +68,8 @@ def cell_size(
     bits = bits_per_axis(d)
     finest = side / ((1 << bits) - 1)
     ordered = jnp.sort(cell_keys(points, mask, low, finest))
-    counts = jnp.stack([_num_filled(ordered, d * level) for level in range(bits + 1)])
+    shifts = d * jnp.arange(bits + 1, dtype=jnp.int32)
+    counts = lax.map(lambda shift: _num_filled(ordered, shift), shifts)
     level = jnp.argmax(counts <= num)  # counts fall; the last is 1
     few = jnp.maximum(counts[level], 1).astype(side.dtype)
     many = jnp.maximum(counts[jnp.maximum(level - 1, 0)], 1).astype(side.dtype)

@@ -20,6 +20,25 @@ class PointCloud(eqx.Module):
     normals: Float[Array, "n d"]
     mask: Bool[Array, " n"]
 
+    def padded(self, num: int) -> "PointCloud":
+        """With masked rows behind it, `num` in all."""
+        rows = (0, num - self.mask.shape[0])
+        return PointCloud(
+            jnp.pad(self.points, (rows, (0, 0))),
+            jnp.pad(self.normals, (rows, (0, 0))),
+            jnp.pad(self.mask, rows),
+        )
+
+    def first(self, num: int) -> "PointCloud":
+        """The first `num` rows, or all."""
+        return PointCloud(self.points[:num], self.normals[:num], self.mask[:num])
+
+
+def levelled(a: PointCloud, b: PointCloud) -> tuple[PointCloud, PointCloud]:
+    """Both with the rows of the larger: clouds of one size share compiled code."""
+    num = max(len(a.mask), len(b.mask))
+    return a.padded(num), b.padded(num)
+
 
 def centroid(points: Points, mask: Mask) -> Float[Array, " d"]:
     """The mean of the valid points (zero where there are none)."""

@@ -1,6 +1,7 @@
 """Registration by kernel correlation, the rival in the PF paper's section 5.1."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -178,7 +179,11 @@ def _scores(
     def indexed(cloud: PointCloud):
         return exact_index(cloud.mask.shape[0]).build(cloud.points, cloud.mask)
 
-    return score_both_ways(source, target, indexed(source), indexed(target), T, spacing)
+    both = score_both_ways(
+        source, target, indexed(source), indexed(target), T[None], spacing
+    )
+    there, back = jax.tree.map(lambda x: x[0], both)
+    return there, back
 
 
 def _covariance(

@@ -169,7 +169,7 @@ class AbstractRegistrar(eqx.Module):
 
     @abc.abstractmethod
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
-        """The cloud that `solve` expects: thinned, with normals."""
+        """The cloud that `solve` expects: thinned, with normals, valid rows first."""
 
     @abc.abstractmethod
     def solve(

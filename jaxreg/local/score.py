@@ -2,10 +2,12 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core.arrays import on_both
 from jaxreg._core.typing import Motion
-from jaxreg.cloud import PointCloud
+from jaxreg.cloud import PointCloud, levelled
 from jaxreg.geometry import lie
 from jaxreg.local.problem import Match, Problem, match
 from jaxreg.neighbours.base import AbstractIndex
@@ -62,13 +64,16 @@ def score_both_ways(
     target: PointCloud,
     source_index: AbstractIndex,
     target_index: AbstractIndex,
-    T_target_source: Motion,
+    T_target_source: Float[Array, "q D D"],
     spacing: Float[Array, ""],
 ) -> tuple[Score, Score]:
-    """Scores of the source on the target and of the target on the source."""
-    forward = Problem.of(source, target, target_index)
-    backward = Problem.of(target, source, source_index)
-    return (
-        score(forward, T_target_source, spacing),
-        score(backward, lie.inverse(T_target_source), spacing),
-    )
+    """Scores of the source on the target and of the target on the source, at poses."""
+    source, target = levelled(source, target)
+    forward = Problem.of(source, target, target_index), T_target_source
+    backward = Problem.of(target, source, source_index), lie.inverse(T_target_source)
+
+    def scores(way: tuple[Problem, Array]) -> Score:
+        problem, T = way
+        return lax.map(lambda T: score(problem, T, spacing), T)
+
+    return on_both(scores, forward, backward)

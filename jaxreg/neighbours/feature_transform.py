@@ -109,7 +109,7 @@ def _swept(table: Array, in_cells: Array, times: int) -> Array:
     merge = _closer if candidates == 1 else _merge
     lines = jnp.moveaxis(table, 0, 1).reshape(resolution, candidates, -1)
 
-    def along_first(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def along_first(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         lines, columns = state
         axes = list(columns)
 
@@ -118,7 +118,7 @@ def _swept(table: Array, in_cells: Array, times: int) -> Array:
             best = merge(own, before, axes, [coordinate, *others])
             return best, best
 
-        def sweep(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        def sweep(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             lines, coordinates = state
             start = jnp.full(lines.shape[1:], -1, lines.dtype)
             lines = lax.scan(step, start, (coordinates, lines))[1]

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.arrays import cast_floats
+from jaxreg._core.arrays import cast_floats, on_both
 from jaxreg._core.checks import check_key, is_concrete
 from jaxreg._core.typing import Key, Mask, Motion, Points
-from jaxreg.cloud import PointCloud, thin
+from jaxreg.cloud import PointCloud, levelled, thin
 from jaxreg.local import (
     AbstractRegistrar,
     AbstractResidual,
@@ -89,8 +89,10 @@ class AbstractSearch(AbstractRegistrar):
         key = check_key(key)
         if key.ndim:
             raise ValueError(f"key: wanted one key, found shape {key.shape}.")
-        target_index = VoxelTable.build(target.points, target.mask)
-        source_index = VoxelTable.build(source.points, source.mask)
+        source_index, target_index = on_both(
+            lambda cloud: VoxelTable.build(cloud.points, cloud.mask),
+            *levelled(source, target),
+        )
         return self.solve_indexed(source, target, source_index, target_index, init, key)
 
     def solve_indexed(

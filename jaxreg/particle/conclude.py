@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.arrays import cast_floats
+from jaxreg._core.arrays import cast_floats, on_both
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.cloud import PointCloud, median_spacing
+from jaxreg.cloud import PointCloud, levelled, median_spacing
 from jaxreg.geometry import lie
 from jaxreg.local import (
     Curvature,
@@ -55,9 +55,20 @@ class Pair(eqx.Module):
     def spacing(self) -> Scalar:
         """Between samples of the coarser cloud."""
         return jnp.maximum(
-            median_spacing(self.target.points, self.target.mask),
-            median_spacing(self.source.points, self.source.mask),
+            *on_both(
+                lambda cloud: median_spacing(cloud.points, cloud.mask),
+                *levelled(self.source, self.target),
+            )
         )
+
+    def scores(
+        self, T: Float[Array, "q D D"], spacing: Scalar
+    ) -> tuple[Score, Float[Array, " q"]]:
+        """Of the source on the target at poses, and the lesser share of both ways."""
+        there, back = score_both_ways(
+            self.source, self.target, self.source_index, self.target_index, T, spacing
+        )
+        return there, jnp.minimum(there.fitness, back.fitness)
 
 
 def conclude(
@@ -93,7 +104,7 @@ def conclude(
     T_modes, sound = _refined(
         pair.problem, kernel, T_modes, mass > 0, spacing, refine_steps
     )
-    there, overlap = _scores(pair, T_modes, spacing)
+    there, overlap = pair.scores(T_modes, spacing)
     overlap = jnp.where(sound, overlap, -1)
     order = jnp.argsort(-overlap) if refine_steps else jnp.arange(num_modes)
     T_modes, mass, overlap, there = jax.tree.map(
@@ -165,20 +176,6 @@ def _refined(
     sound = used & jnp.all(jnp.isfinite(T), axis=(1, 2))
     eye = lie.identity(T.shape[-1] - 1, T.dtype)
     return jnp.where(sound[:, None, None], T, eye), sound
-
-
-def _scores(
-    pair: Pair, T: Float[Array, "q D D"], spacing: Scalar
-) -> tuple[Score, Float[Array, " q"]]:
-    """Of the source on the target, and the lesser share of both ways."""
-
-    def both(T: Motion) -> tuple[Score, Score]:
-        return score_both_ways(
-            pair.source, pair.target, pair.source_index, pair.target_index, T, spacing
-        )
-
-    there, back = lax.map(both, T)
-    return there, jnp.minimum(there.fitness, back.fitness)
 
 
 def _polished(

@@ -4,11 +4,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from jaxreg._core.arrays import on_both
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.cloud import PointCloud, centroid, rms_radius
+from jaxreg.cloud import centroid, rms_radius
 from jaxreg.geometry import lie
 from jaxreg.local import (
     AbstractRegistrar,
@@ -19,6 +20,10 @@ from jaxreg.local import (
 )
 
 
+# Clouds are padded to one size if that makes the smaller at most so many times as large.
+_MAX_PADDING = 2
+
+
 def register_pair(
     method: AbstractRegistrar,
     pair: tuple[Array, ...],
@@ -26,21 +31,47 @@ def register_pair(
     key: Array | None,
 ) -> RegistrationSolution:
     """Of sources, targets and their masks; traced."""
-    source, target, source_mask, target_mask = pair
-    source, source_mask = _finite(source, source_mask)
-    target, target_mask = _finite(target, target_mask)
-    enough = _distinct_enough(source, source_mask) & _distinct_enough(
-        target, target_mask
-    )
-    frames = _Frames.of(source, source_mask, target, target_mask)
+    source, target, *masks = pair
+    sides = on_both(_Side.of, *_levelled((source, masks[0]), (target, masks[1])))
+    frames = _Frames(sides[0].mean, sides[1].mean, sides[1].radius)
     method = method.in_unit(frames.radius).in_frames(frames.enter, source.shape[1])
-    clouds = _prepared(
-        method,
-        ((source - frames.source_mean) / frames.radius, source_mask),
-        ((target - frames.target_mean) / frames.radius, target_mask),
+    source_cloud, target_cloud = on_both(
+        lambda cloud: method.prepare(*cloud),
+        *(((side.points - side.mean) / frames.radius, side.mask) for side in sides),
     )
     init = None if init is None else frames.enter(init)
-    return frames.leave(method.solve(*clouds, init, key), enough)
+    solution = method.solve(
+        source_cloud.first(len(source)), target_cloud.first(len(target)), init, key
+    )
+    return frames.leave(solution, sides[0].enough & sides[1].enough)
+
+
+class _Side(eqx.Module):
+    """A cloud as given, cleaned.
+
+    Attributes:
+        points, mask: zero and masked where not finite.
+        mean: the centroid.
+        radius: the root mean square distance from it; one where that is zero.
+        enough: whether at least d + 1 distinct points are valid.
+    """
+
+    points: Float[Array, "n d"]
+    mask: Bool[Array, " n"]
+    mean: Float[Array, " d"]
+    radius: Scalar
+    enough: Bool[Array, ""]
+
+    @classmethod
+    def of(cls, cloud: tuple[Array, Array]) -> "_Side":
+        points, mask = cloud
+        mask = mask & jnp.all(jnp.isfinite(points), axis=1)
+        points = jnp.where(mask[:, None], points, 0)
+        frozen = lax.stop_gradient(points)
+        radius = rms_radius(frozen, mask)
+        radius = jnp.where(radius > 0, radius, 1)
+        enough = _distinct_enough(frozen, mask)
+        return cls(points, mask, centroid(frozen, mask), radius, enough)
 
 
 class _Frames(eqx.Module):
@@ -54,15 +85,6 @@ class _Frames(eqx.Module):
     source_mean: Float[Array, " d"]
     target_mean: Float[Array, " d"]
     radius: Scalar
-
-    @classmethod
-    def of(
-        cls, source: Array, source_mask: Array, target: Array, target_mask: Array
-    ) -> "_Frames":
-        radius = rms_radius(target, target_mask)
-        radius = jnp.where(radius > 0, radius, 1)
-        means = centroid(source, source_mask), centroid(target, target_mask)
-        return lax.stop_gradient(cls(*means, radius))
 
     def enter(self, T: Motion) -> Motion:
         """A pose in the frames of `solve`."""
@@ -107,25 +129,22 @@ class _Frames(eqx.Module):
         )
 
 
-def _prepared(
-    method: AbstractRegistrar, source: tuple[Array, Array], target: tuple[Array, Array]
-) -> tuple[PointCloud, PointCloud]:
-    """Both clouds as the method wants them."""
-    if source[0].shape != target[0].shape:
-        return method.prepare(*source), method.prepare(*target)
-    # Clouds of one size share a loop, which compiles the preparation once.
-    both = jax.tree.map(lambda *x: jnp.stack(x), source, target)
-    prepared = lax.map(lambda cloud: method.prepare(*cloud), both)
-    source_cloud, target_cloud = (
-        jax.tree.map(lambda x, at=at: x[at], prepared) for at in (0, 1)
-    )
-    return source_cloud, target_cloud
+def _levelled(
+    a: tuple[Array, Array], b: tuple[Array, Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Points and masks with rows added to the fewer, if they are not many.
 
+    Clouds of one size share what is compiled for them.
+    """
+    num = max(len(a[1]), len(b[1]))
+    if num > _MAX_PADDING * min(len(a[1]), len(b[1])):
+        return a, b
 
-def _finite(points: Array, mask: Array) -> tuple[Array, Array]:
-    """Masks rows that are not finite; masked rows become a valid row or zero."""
-    mask = mask & jnp.all(jnp.isfinite(points), axis=1)
-    return jnp.where(mask[:, None], points, 0), mask
+    def padded(points: Array, mask: Array) -> tuple[Array, Array]:
+        rows = (0, num - len(mask))
+        return jnp.pad(points, (rows, (0, 0))), jnp.pad(mask, rows)
+
+    return padded(*a), padded(*b)
 
 
 def _distinct_enough(points: Array, mask: Array) -> Array:
