@@ -13,8 +13,8 @@ from jaxreg.averaging.two_level import TwoLevel, two_level
 
 
 # Unknowns below which the inverse is exact, in one of its blocks, and at most in its
-# coarse system.
-_EXACT, _BLOCK, _COARSE = 384, 96, 1500
+# coarse system; and frames between two nodes of that.
+_EXACT, _BLOCK, _COARSE, _SPACING = 384, 48, 1500, 16
 
 
 def block_diagonal(
@@ -33,10 +33,10 @@ def block_inverse(
 ) -> TwoLevel:
     """About the inverse of H + damping diag(H), H = B' Q B, with frame 0 held."""
     size = num_poses * Q.shape[-1]
-    block = max(_BLOCK // Q.shape[-1], -(-size // _COARSE))
-    block = num_poses if size <= _EXACT else block
+    block = num_poses if size <= _EXACT else _BLOCK // Q.shape[-1]
+    spacing = max(_SPACING, -(-size // _COARSE))
     extra = damping * block_diagonal(edges, Q, num_poses)
-    return two_level(edges, Q, num_poses, block, extra)
+    return two_level(edges, Q, num_poses, block, spacing, extra)
 
 
 def solve_block_flow(
@@ -53,7 +53,7 @@ def solve_block_flow(
     extra = damping * block_diagonal(edges, Q, num)
 
     def apply(x: Array) -> Array:
-        flow = jnp.sum(Q * (x[j] - x[i])[:, None, :], axis=-1)
+        flow = jnp.einsum("eab,eb->ea", Q, x[j] - x[i])
         own = jnp.sum(extra * x[:, None, :], axis=-1)
         return (divergence(edges, flow, num) + own).at[0].set(0)
 

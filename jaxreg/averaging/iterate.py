@@ -59,7 +59,8 @@ def averaging_step(rows_of: RowsOf) -> Step:
     def step(graph: PoseGraph, T: Array, trust: Array, width: Array) -> Array:
         flow = lie.log(graph.residual_motions(T))
         weight = rows_of(graph, trust)
-        tangent = solve_flow(graph.edges, weight, flow, graph.num_poses)
+        # Each step takes up what the last one left.
+        tangent = solve_flow(graph.edges, weight, flow, graph.num_poses, 1e-4)
         return nearby_rotation(product(lie.exp(tangent), T))
 
     return step

@@ -5,9 +5,8 @@ weighted incidence matrix, so its least-squares solution needs the v x v Laplaci
 B' B with k right-hand sides and never a k v x k v matrix. Frame 0 is held at 0.
 
 Up to `DENSE_LIMIT` frames the matrix is formed; above, conjugate gradients work on the
-edges, preconditioned by two levels: exact solves in blocks of consecutive frames and a
-coarse system with one unknown per block. Numbering frames along the trajectory helps
-them; any numbering is right.
+edges, preconditioned by two levels (`two_level`). Numbering frames along the trajectory
+helps them; any numbering is right.
 """
 
 import jax.numpy as jnp
@@ -19,7 +18,8 @@ from jaxreg.averaging.two_level import two_level
 
 #: Largest number of frames for which a dense matrix over frames is formed.
 DENSE_LIMIT = 128
-_BLOCK = 64
+# Frames in a block, at least between nodes of the coarse system, and nodes at most.
+_BLOCK, _SPACING, _NODES = 32, 16, 1500
 
 
 def divergence(
@@ -35,25 +35,31 @@ def solve_flow(
     weight: Float[Array, " e"],
     flow: Float[Array, "e k"],
     num_poses: int,
+    tolerance: float = 0.0,
 ) -> Float[Array, "v k"]:
     """The x with x_0 = 0 that minimises sum_e weight_e |x_j - x_i - flow_e|^2.
 
-    Frames that no weight holds stay at 0 (the solution of least norm).
+    Frames that no weight holds stay at 0 (the solution of least norm). Graphs above
+    `DENSE_LIMIT` are solved to a relative `tolerance`, at best that of the dtype.
     """
     # The weights are relative: no power of them can underflow the whole system.
     top = jnp.max(weight)
     w = weight / jnp.where(top > 0, top, 1)
-    return solve_laplacian(edges, w, divergence(edges, w[:, None] * flow, num_poses))
+    rhs = divergence(edges, w[:, None] * flow, num_poses)
+    return solve_laplacian(edges, w, rhs, tolerance)
 
 
 def solve_laplacian(
-    edges: Int[Array, "e 2"], weight: Float[Array, " e"], rhs: Float[Array, "v k"]
+    edges: Int[Array, "e 2"],
+    weight: Float[Array, " e"],
+    rhs: Float[Array, "v k"],
+    tolerance: float = 0.0,
 ) -> Float[Array, "v k"]:
     """The x with x_0 = 0 and B' W B x = rhs but for row 0; weights of at most 1."""
     rhs = rhs.at[0].set(0)
     if rhs.shape[0] <= DENSE_LIMIT:
         return jnp.linalg.lstsq(laplacian(edges, weight, rhs.shape[0]), rhs)[0]
-    return _conjugate_gradients(edges, weight, rhs)
+    return _conjugate_gradients(edges, weight, rhs, tolerance)
 
 
 def laplacian(
@@ -67,11 +73,14 @@ def laplacian(
     return L.at[0].set(0).at[:, 0].set(0).at[0, 0].set(1)
 
 
-def _conjugate_gradients(edges: Array, weight: Array, rhs: Array) -> Array:
+def _conjugate_gradients(
+    edges: Array, weight: Array, rhs: Array, tolerance: float
+) -> Array:
     """Preconditioned conjugate gradients, the k columns side by side."""
     num_poses = rhs.shape[0]
     i, j = edges[:, 0], edges[:, 1]
-    inverse = two_level(edges, weight[:, None, None], num_poses, _BLOCK)
+    spacing = max(_SPACING, -(-num_poses // _NODES))
+    inverse = two_level(edges, weight[:, None, None], num_poses, _BLOCK, spacing)
 
     def apply(x: Array) -> Array:
         return (
@@ -83,6 +92,6 @@ def _conjugate_gradients(edges: Array, weight: Array, rhs: Array) -> Array:
         lambda r: inverse(r[:, None, :])[:, 0, :],
         rhs,
         columns=True,
-        tolerance=3 * float(jnp.finfo(rhs.dtype).eps),
+        tolerance=max(tolerance, 3 * float(jnp.finfo(rhs.dtype).eps)),
         max_steps=500,
     )[0]

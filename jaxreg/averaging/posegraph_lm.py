@@ -27,8 +27,11 @@ from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
 from jaxreg.robust import AbstractKernel
 
 
-# Rounds of conjugate gradients after which their preconditioner is built anew.
-_STALE = 60
+# A preconditioner is built anew when it takes so many times the rounds of its first use.
+_STALE = 2
+# Damping after the first refused step, and the least. There is none before: even 1e-9
+# of the diagonal holds back the bending of a long chain, so that steps converge slowly.
+_DAMPED, _LEAST = 1e-6, 1e-9
 
 
 class PoseGraphLM(AbstractAverager):
@@ -44,7 +47,8 @@ class PoseGraphLM(AbstractAverager):
         kernel_width: its width; in standard deviations if the information is that of
             the noise.
         max_steps: largest number of steps (static).
-        tolerance: stop when a step lowers the objective by less than this share.
+        tolerance: stop when the next step would lower the objective by less than this
+            share, by the ratio of the last two.
         initialiser: finds the start when `init` is None.
 
     The length unit matters without information, as an error of one radian counts as
@@ -103,14 +107,19 @@ class Problem(NamedTuple):
 
     graph: PoseGraph
     error: Callable[[Array, Array], Array]
-    precision: Array
+    precision: Array  # (e, m, m), or (e, m) if diagonal
     loss: Callable[[Array], Array]
     trust: Callable[[Array], Array]
 
     def squares(self, T: Array) -> Array:
         """The squared error r' Omega r of each edge."""
         r = self.error(_predicted(self.graph, T), self.graph.T_i_j)
-        return jnp.sum(r * jnp.sum(self.precision * r[:, None, :], axis=-1), axis=-1)
+        return jnp.sum(r * self._weighted(r[..., None])[..., 0], axis=-1)
+
+    def _weighted(self, J: Array) -> Array:
+        if self.precision.ndim == 2:
+            return self.precision[..., None] * J
+        return product(self.precision, J)
 
     def cost(self, T: Array) -> Array:
         """The objective."""
@@ -130,7 +139,7 @@ class Problem(NamedTuple):
 
         r, J = jax.vmap(along, out_axes=(None, -1))(_generators(T))
         trust = self.trust(self.squares(T))[:, None, None]
-        WJ = product(trust * self.precision, J)
+        WJ = trust * self._weighted(J)
         Q = product(jnp.swapaxes(J, -1, -2), WJ)
         return Q, jnp.sum(WJ * r[:, :, None], axis=-2)
 
@@ -138,7 +147,7 @@ class Problem(NamedTuple):
 def robust_problem(
     graph: PoseGraph,
     error: Callable[[Array, Array], Array],
-    precision: Float[Array, "e m m"],
+    precision: Float[Array, "e ..."],
     kernel: AbstractKernel,
     width: Float[Array, ""],
 ) -> Problem:
@@ -166,25 +175,31 @@ def minimise(
     max_steps: int,
     tolerance: Array | float,
 ) -> Minimum:
-    """Steps until one lowers the objective by less than a share of `tolerance`."""
+    """Steps until the next would lower the objective by less than `tolerance` of it."""
     graph, cost = problem.graph, problem.cost(T_start)
     limit = jnp.maximum(tolerance, 4 * jnp.finfo(cost.dtype).eps)
-    damping = jnp.asarray(1e-7, cost.dtype)
-    Q = problem.normal(T_start)[0]
+    zero, inf = jnp.zeros_like(cost), jnp.full_like(cost, jnp.inf)
+    inverse = jax.eval_shape(
+        lambda: block_inverse(
+            graph.edges, problem.normal(T_start)[0], graph.num_poses, zero
+        )
+    )
     begin = _State(
         T=T_start,
         cost=cost,
-        damping=damping,
-        inverse=block_inverse(graph.edges, Q, graph.num_poses, damping),
-        gain=jnp.asarray(jnp.inf, cost.dtype),
+        damping=zero,
+        inverse=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), inverse),
+        usual=jnp.asarray(0, jnp.int32),
+        gain=inf,
+        next_gain=inf,
         step=jnp.asarray(0, jnp.int32),
     )
     end = jax.lax.while_loop(
-        lambda s: (s.gain > limit) & (s.step < max_steps),
+        lambda s: (s.next_gain > limit) & (s.step < max_steps),
         lambda s: _try_step(problem, s),
         begin,
     )
-    return Minimum(end.T, end.gain <= limit, end.step)
+    return Minimum(end.T, end.next_gain <= limit, end.step)
 
 
 class _State(NamedTuple):
@@ -192,7 +207,9 @@ class _State(NamedTuple):
     cost: Array
     damping: Array
     inverse: TwoLevel  # of the normal equations at this or an earlier step
+    usual: Array  # rounds that it first took, 0 where it is to be built
     gain: Array  # share of the cost that the last step took away
+    next_gain: Array  # what the next one is expected to
     step: Array
 
 
@@ -230,15 +247,20 @@ def _chordal_precision(graph: PoseGraph) -> Array:
     kappa, tau = chordal_weights(graph)
     d = graph.dim
     parts = [jnp.repeat(kappa[:, None], d * d, 1), jnp.repeat(tau[:, None], d, 1)]
-    return jax.vmap(jnp.diag)(jnp.concatenate(parts, axis=1))
+    return jnp.concatenate(parts, axis=1)
 
 
 def _try_step(problem: Problem, s: _State) -> _State:
     """One damped step, kept if it lowers the cost."""
     Q, force = problem.normal(s.T)
     graph = problem.graph
+    inverse = jax.lax.cond(
+        s.usual > 0,
+        lambda: s.inverse,
+        lambda: block_inverse(graph.edges, Q, graph.num_poses, s.damping),
+    )
     x, rounds = solve_block_flow(
-        graph.edges, Q, force, s.inverse, s.damping, tolerance=1e-2
+        graph.edges, Q, force, inverse, s.damping, tolerance=1e-2
     )
     T = nearby_rotation(product(lie.exp(x), s.T))
     cost = problem.cost(T)
@@ -246,17 +268,20 @@ def _try_step(problem: Problem, s: _State) -> _State:
     gain = jnp.where(s.cost > 0, (s.cost - cost) / jnp.where(s.cost > 0, s.cost, 1), 0)
     # A refused step calls for more damping, unless damping can help no more.
     refused = jnp.where(s.damping < 1e3, jnp.inf, 0)
-    damping = jnp.where(better, jnp.maximum(s.damping / 10, 1e-9), s.damping * 30)
-    inverse = jax.lax.cond(
-        rounds > _STALE,
-        lambda: block_inverse(graph.edges, Q, graph.num_poses, damping),
-        lambda: s.inverse,
-    )
+    eased = jnp.where(s.damping > _LEAST, s.damping / 10, 0)
+    gain = jnp.where(better, gain, refused).astype(cost.dtype)
+    # Steps converge at least linearly: each gains less than the one before.
+    ratio = jnp.where(jnp.isfinite(s.gain), jnp.minimum(gain / s.gain, 1), 1)
+    damping = jnp.where(better, eased, jnp.maximum(s.damping * 30, _DAMPED))
+    usual = jnp.where(s.usual > 0, s.usual, jnp.maximum(rounds, 1))
+    stale = rounds > _STALE * usual
     return _State(
         T=jnp.where(better, T, s.T),
         cost=jnp.where(better, cost, s.cost),
         damping=damping,
         inverse=inverse,
-        gain=jnp.where(better, gain, refused).astype(cost.dtype),
+        usual=jnp.where(stale, 0, usual),
+        gain=gain,
+        next_gain=gain * ratio,
         step=s.step + 1,
     )
