@@ -44,12 +44,6 @@ class Workload(NamedTuple):
     run: Callable[[AbstractSearch], np.ndarray]
 
 
-def per_point(method: ParticleFilter) -> int:
-    """Look-ups of a search for each point that particles are measured on."""
-    later = method.num_times * (method.inner_steps + 1)
-    return method.num_prior * (method.prior_steps + 1) + method.num_particles * later
-
-
 def methods(base: ParticleFilter, budget: float) -> dict[str, AbstractSearch]:
     """The filter scaled to a share of its look-ups, and rivals with as many."""
     carried = max(round(budget * base.num_particles), 2)
@@ -57,7 +51,7 @@ def methods(base: ParticleFilter, budget: float) -> dict[str, AbstractSearch]:
     ours = replace(base, num_prior=drawn, num_particles=carried)
     starts = {
         f"many starts, {steps} steps": MultiStart(
-            num_starts=max(per_point(ours) // (steps + 1), 1),
+            num_starts=max(ours.most_look_ups // (steps + 1), 1),
             num_steps=steps,
             num_points=base.num_points,
             num_modes=base.num_modes,
@@ -115,7 +109,7 @@ def compare(num: int, model: np.ndarray, folder: Path, out: Path) -> list[dict]:
     for work in workloads(num, model, folder):
         print(f"\n{work.title}: right, %\n{'look-ups':24s}", end="")
         counts = [
-            per_point(m) * work.base.num_points
+            m.most_look_ups * work.base.num_points
             for budget in work.budgets
             if isinstance(m := methods(work.base, budget)["filter"], ParticleFilter)
         ]

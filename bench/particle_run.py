@@ -113,7 +113,5 @@ def look_ups(registrar: AbstractRegistrar, trials: Trials) -> int:
         each = registrar.num_starts * (registrar.num_steps + 1)
     else:
         assert isinstance(registrar, ParticleFilter)
-        later = registrar.num_times * (registrar.inner_steps + 1)
-        each = registrar.num_prior * (registrar.prior_steps + 1)
-        each += registrar.num_particles * later
+        each = registrar.most_look_ups
     return each * min(n, registrar.num_points)

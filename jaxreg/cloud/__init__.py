@@ -1,8 +1,8 @@
 """Point clouds: thinned, described and measured inside `jit`."""
 
 from jaxreg.cloud.point_cloud import PointCloud as PointCloud
-from jaxreg.cloud.point_cloud import levelled as levelled
 from jaxreg.cloud.point_cloud import centroid as centroid
+from jaxreg.cloud.point_cloud import levelled as levelled
 from jaxreg.cloud.point_cloud import rms_radius as rms_radius
 from jaxreg.cloud.thin import estimate_normals as estimate_normals
 from jaxreg.cloud.thin import thin as thin

@@ -47,7 +47,9 @@ def cell_keys(
     return jnp.where(mask, morton_keys(cells.T), UNUSED)
 
 
-def _num_filled(ordered: Int[Array, " n"], shift: Int[Array, ""] | int = 0) -> Int[Array, ""]:
+def _num_filled(
+    ordered: Int[Array, " n"], shift: Int[Array, ""] | int = 0
+) -> Int[Array, ""]:
     key = ordered >> shift
     new = (key[1:] != key[:-1]) & (ordered[1:] != UNUSED)
     return jnp.sum(new) + (ordered[0] != UNUSED)

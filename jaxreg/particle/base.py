@@ -21,13 +21,15 @@ from jaxreg.local import (
     Problem,
     RegistrationSolution,
 )
-from jaxreg.neighbours import AbstractIndex, VoxelTable
+from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
 from jaxreg.particle.conclude import Pair, conclude
 from jaxreg.particle.priors import AbstractPrior, GaussianPrior, UniformPrior
 from jaxreg.particle.state import Particles
 from jaxreg.robust import AbstractKernel
 
 
+# Source points that only the scores look up by comparing all pairs.
+_FEW = 600
 # The agreement of normals decides what is believed: the careful estimate.
 _NORMAL_NEIGHBOURS = 10
 
@@ -89,10 +91,14 @@ class AbstractSearch(AbstractRegistrar):
         key = check_key(key)
         if key.ndim:
             raise ValueError(f"key: wanted one key, found shape {key.shape}.")
-        source_index, target_index = on_both(
-            lambda cloud: VoxelTable.build(cloud.points, cloud.mask),
-            *levelled(source, target),
-        )
+        if len(source.mask) <= _FEW:  # compared in less time than a table is filled in
+            source_index = BruteForce.build(source.points, source.mask)
+            target_index = VoxelTable.build(target.points, target.mask)
+        else:
+            source_index, target_index = on_both(
+                lambda cloud: VoxelTable.build(cloud.points, cloud.mask),
+                *levelled(source, target),
+            )
         return self.solve_indexed(source, target, source_index, target_index, init, key)
 
     def solve_indexed(

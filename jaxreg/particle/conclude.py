@@ -1,5 +1,8 @@
 """From many measured poses to an answer: modes, refinement, scores, polish, status."""
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -36,6 +39,9 @@ _APART = 0.3
 _RIVAL = 0.95
 # Steps of the most accurate residual, where it is close already.
 _POLISH = 8
+
+
+Out = TypeVar("Out")
 
 
 class Pair(eqx.Module):
@@ -171,7 +177,7 @@ def _refined(
     optimiser = cast_floats(optimiser, T.dtype)
     if num_steps:
         widths = spacing * jnp.geomspace(2, 0.5, num_steps, dtype=T.dtype)
-        T = lax.map(lambda T: optimiser.repeat(problem, T, widths), T)
+        T = _of_used(lambda T: optimiser.repeat(problem, T, widths), T, used)
     T = lie.orthonormalise(T)
     sound = used & jnp.all(jnp.isfinite(T), axis=(1, 2))
     eye = lie.identity(T.shape[-1] - 1, T.dtype)
@@ -194,14 +200,27 @@ def _polished(
     optimiser = LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton())
     optimiser = cast_floats(optimiser, T.dtype)
 
-    def one(mode: tuple[Motion, Bool[Array, ""]]) -> tuple[Motion, Curvature]:
-        T, sound = mode
-        polished = optimiser.repeat(problem, T, jnp.full(num_steps, width))
-        T = jnp.where(sound, lie.orthonormalise(polished), T)
-        found = match(problem, T)
-        return T, Curvature.of(optimiser, problem, T, found, width)
+    def polish(T: Motion) -> tuple[Motion, Curvature]:
+        T = optimiser.repeat(problem, T, jnp.full(num_steps, width))
+        T = lie.orthonormalise(T)
+        return T, Curvature.of(optimiser, problem, T, match(problem, T), width)
 
-    return lax.map(one, (T, sound))
+    polished, curvature = _of_used(polish, T, sound)
+    return jnp.where(sound[:, None, None], polished, T), curvature
+
+
+def _of_used(
+    function: Callable[[Motion], Out], T: Float[Array, "q D D"], used: Bool[Array, " q"]
+) -> Out:
+    """Of each pose in use, one after another; zero of the others."""
+
+    def one(mode: tuple[Motion, Bool[Array, ""]]) -> Out:
+        T, used = mode
+        shapes = jax.eval_shape(function, T)
+        zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return lax.cond(used, function, lambda _: zero, T)
+
+    return lax.map(one, (T, used))
 
 
 def _status(

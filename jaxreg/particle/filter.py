@@ -1,6 +1,7 @@
 """`ParticleFilter`: registration without an initial guess (the PF paper's algorithm).
 
-    t = 0        draw from the prior, measure, weigh                 (section 4.2)
+    t = 0        draw from the prior, measure, weigh                 (section 4.2);
+                 end here where the answer is sure                    (`draw`)
     t = 1, 2, .. resample, diffuse along the motion error (Eq. 6-8), measure,
                  weigh (Eq. 9), until the motion errors are small or t = num_times
 
@@ -19,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import is_concrete
@@ -33,6 +34,12 @@ from jaxreg.local import (
     Problem,
 )
 from jaxreg.particle.base import AbstractSearch, Found, check_counts, check_positive
+from jaxreg.particle.draw import (
+    SETTLE_STEPS,
+    Drawn,
+    draw_until_sure,
+    most_look_ups,
+)
 from jaxreg.particle.dynamics import AbstractDynamics, StochasticDynamics
 from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy
 from jaxreg.particle.measure import measure
@@ -53,9 +60,8 @@ class ParticleFilter(AbstractSearch):
     """Global registration by a particle filter over ICP.
 
     Lengths are in units of the target's root mean square radius, so the unit of the
-    input does not matter. One search looks up at most
-    `num_points * (num_prior * (prior_steps + 1)
-    + num_particles * num_times * (inner_steps + 1))` closest points.
+    input does not matter. One search looks up at most `num_points * most_look_ups`
+    closest points, by default 7.5 million, and a tenth of that where it is sure early.
 
     Attributes:
         num_prior: particles drawn from the prior and measured at t = 0.
@@ -67,6 +73,10 @@ class ParticleFilter(AbstractSearch):
             the particle of least energy, as in the paper.
         num_points: source points that a particle is measured on.
         num_modes: distinct poses that are refined and returned.
+        num_agreeing: the draws end, and the search, as soon as so many of them have
+            settled at the best pose and none elsewhere nearly as well; with zero, or an
+            energy that is not bounded, all are drawn and none is settled, as in the
+            paper.
         max_points: both clouds are thinned to about this many points.
         batch_size: particles in one vectorised block; small enough for a CPU's cache.
         prior: where the particles start; None is `GaussianPrior()` around `init` where
@@ -94,14 +104,15 @@ class ParticleFilter(AbstractSearch):
     Gradients: none; refine with `ICP` from the answer to differentiate it.
     """
 
-    num_prior: int = eqx.field(default=1024, static=True)
+    num_prior: int = eqx.field(default=1536, static=True)
     num_particles: int = eqx.field(default=256, static=True)
-    num_times: int = eqx.field(default=7, static=True)
+    num_times: int = eqx.field(default=3, static=True)
     prior_steps: int = eqx.field(default=6, static=True)
     inner_steps: int = eqx.field(default=3, static=True)
     refine_steps: int = eqx.field(default=24, static=True)
     num_points: int = eqx.field(default=400, static=True)
     num_modes: int = eqx.field(default=8, static=True)
+    num_agreeing: int = eqx.field(default=4, static=True)
     max_points: int = eqx.field(default=4096, static=True)
     batch_size: int = eqx.field(default=32, static=True)
     prior: AbstractPrior | None = None
@@ -122,7 +133,8 @@ class ParticleFilter(AbstractSearch):
         """Refuses counts that leave nothing to do."""
         names = "num_prior num_times prior_steps inner_steps num_points max_points"
         least = dict.fromkeys([*names.split(), "num_modes", "batch_size"], 1)
-        check_counts(self, {**least, "num_particles": 2, "refine_steps": 0})
+        may_be_zero = {"refine_steps": 0, "num_agreeing": 0}
+        check_counts(self, {**least, "num_particles": 2, **may_be_zero})
         if self.num_particles > self.num_prior:
             raise ValueError(
                 "ParticleFilter: num_particles must be from 2 to num_prior = "
@@ -137,44 +149,93 @@ class ParticleFilter(AbstractSearch):
         if isinstance(self.prior, GivenParticles):
             self.prior.check_number(self.num_prior, "num_prior")
 
+    @property
+    def most_look_ups(self) -> int:
+        """Closest points looked up for each source point where never sure."""
+        drawn = self.num_prior * (self.prior_steps + 1)
+        if self._settles:
+            drawn = most_look_ups(self.num_prior, self.prior_steps, self.batch_size)
+        return drawn + self.num_particles * self.num_times * (self.inner_steps + 1)
+
+    @property
+    def _settles(self) -> bool:
+        """Whether it may be sure early: chance is known of bounded energies only."""
+        return self.num_agreeing > 0 and self.energy.resolution > 0
+
     def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
         """The filter (PF paper, section 4.2)."""
         d, dtype = problem.source.shape[0], problem.source.dtype
         key_prior, key_loop = jax.random.split(key)
         T = self._start(key_prior, self.num_prior, init, dtype, d)
         optimiser = self._optimiser(dtype)
-        kept = self.num_times + 1 if self.dynamics.needs_path else None
-        start = _Carry(
-            Particles.at(T, self.num_prior, kept),
-            jnp.zeros((), jnp.int32),
-            jnp.asarray(True),
-        )
+        drawn = self._draw(problem, optimiser, T)
 
         def body(carry: _Carry) -> _Carry:
             key = jax.random.fold_in(key_loop, carry.time)
             particles = self._advance(key, problem, optimiser, carry)
-            live = jnp.arange(T.shape[0]) < self._num_rows(carry.time)
+            live = jnp.arange(T.shape[0]) < self.num_particles
             error = jnp.where(live[:, None], jnp.abs(particles.motion_error), 0)
             # Negated: an error that is not a number has not died.
             moving = ~(jnp.max(error) <= self.tolerance)
-            return _Carry(self._remember(particles, carry), carry.time + 1, moving)
+            return _Carry(_remembered(particles, carry.time), carry.time + 1, moving)
 
-        # At least to t = 1, where num_particles of the prior are left.
         end = lax.while_loop(
-            lambda c: (c.moving | (c.time < 2)) & (c.time <= self.num_times),
+            lambda c: c.moving & (c.time <= self.num_times),
             body,
-            start,
+            _Carry(drawn.particles, jnp.ones((), jnp.int32), ~drawn.sure),
         )
-        steps = self.prior_steps + (end.time - 1) * self.inner_steps
         particles = end.particles.rows(slice(self.num_particles))
+        steps = self.prior_steps + (end.time - 1) * self.inner_steps
+        if self._settles:
+            particles = _either(drawn, particles)
+            steps = steps + SETTLE_STEPS
         return Found(particles, steps, ~end.moving)
 
-    def _num_rows(self, time: Int[Array, ""]) -> Int[Array, ""]:
-        """Particles in use: at t = 0 the whole prior, later the first N rows.
-
-        One loop with a varying number of rows compiles the measurement once.
-        """
-        return jnp.where(time == 0, self.num_prior, self.num_particles)
+    def _draw(
+        self, problem: Problem, optimiser: LocalOptimiser, T: Float[Array, "p D D"]
+    ) -> Drawn:
+        """T = 0: the prior, measured and weighed."""
+        start, end = (jnp.asarray(x) for x in (self.width_start, self.width_end))
+        batch = min(self.batch_size, self.num_prior)
+        if self._settles:
+            drawn = draw_until_sure(
+                problem,
+                optimiser,
+                self.energy,
+                T,
+                (start, end),
+                num=self.num_prior,
+                num_steps=self.prior_steps,
+                num_agreeing=self.num_agreeing,
+                batch_size=batch,
+            )
+        else:
+            particles = measure(
+                problem,
+                optimiser,
+                self.energy,
+                Particles.at(T, self.num_prior),
+                T,
+                (start, start),
+                num_rows=self.num_prior,
+                num_steps=self.prior_steps,
+                batch_size=batch,
+            )
+            none = particles.rows(slice(0))
+            drawn = Drawn(particles, none, none.energy, jnp.asarray(False))
+        particles = self._weighed(problem, drawn.particles, self.num_prior)
+        error = self.prior_error_share * particles.motion_error
+        particles = eqx.tree_at(lambda p: p.motion_error, particles, error)
+        if self.dynamics.needs_path:
+            shape = (*error.shape[:1], self.num_times + 1, *error.shape[1:])
+            particles = eqx.tree_at(
+                lambda p: p.path,
+                particles,
+                jnp.zeros(shape, error.dtype),
+                is_leaf=lambda x: x is None,
+            )
+        particles = _remembered(particles, jnp.zeros((), jnp.int32))
+        return eqx.tree_at(lambda d: d.particles, drawn, particles)
 
     def _advance(
         self, key: Key, problem: Problem, optimiser: LocalOptimiser, carry: _Carry
@@ -185,46 +246,65 @@ class ParticleFilter(AbstractSearch):
         """
         particles, time = carry.particles, carry.time
         key_resample, key_predict = jax.random.split(key)
-        num = self._num_rows(time)
-        same_number = self.num_prior == self.num_particles
         rows, log_weight = self.resampler(
             key_resample,
             particles.log_weight,
-            num,
-            may_keep=(time != 1) | same_number,
+            jnp.asarray(self.num_particles),
+            may_keep=(time != 1) | (self.num_prior == self.num_particles),
         )
-        # Nothing has been measured before t = 0.
-        rows = jnp.where(time == 0, jnp.arange(rows.size), rows)
         particles = eqx.tree_at(
             lambda p: p.log_weight, particles.rows(rows), log_weight
         )
         T_predicted = self.dynamics(key_predict, particles, time)
-        dtype = T_predicted.dtype
-        share = time.astype(dtype) / self.num_times
+        share = time.astype(T_predicted.dtype) / self.num_times
+        width = self.width_start * (self.width_end / self.width_start) ** share
+        num = T_predicted.shape[0]
         particles = measure(
             problem,
             optimiser,
             self.energy,
-            particles,
+            eqx.tree_at(
+                lambda p: (p.motion_error, p.energy),
+                particles,
+                (
+                    jnp.zeros_like(particles.motion_error),
+                    jnp.full(num, jnp.inf, T_predicted.dtype),
+                ),
+            ),
             T_predicted,
-            self.width_start * (self.width_end / self.width_start) ** share,
-            num_rows=num,
-            num_steps=jnp.where(time == 0, self.prior_steps, self.inner_steps),
+            (width, width),
+            num_rows=self.num_particles,
+            num_steps=self.inner_steps,
             batch_size=min(self.batch_size, self.num_prior),
         )
-        size = jnp.minimum(self.sample_share * num.astype(dtype), self.num_particles)
+        return self._weighed(problem, particles, self.num_particles)
+
+    def _weighed(self, problem: Problem, particles: Particles, num: int) -> Particles:
+        """With the weights of the first `num` times their likelihoods."""
+        dtype = particles.energy.dtype
+        size = jnp.minimum(self.sample_share * num, self.num_particles).astype(dtype)
         points = jnp.maximum(jnp.sum(problem.source_mask), 1).astype(dtype)
         coldest = self.energy.resolution / points
-        log_weight = log_weight + log_likelihood(particles.energy, size, coldest)
-        live = jnp.arange(rows.size) < num
-        return particles.weighted(normalised(log_weight, live))
+        likelihood = log_likelihood(particles.energy, size, coldest)
+        live = jnp.arange(particles.energy.size) < num
+        return particles.weighted(normalised(particles.log_weight + likelihood, live))
 
-    def _remember(self, particles: Particles, carry: _Carry) -> Particles:
-        """With the motion error as the dynamics will see it, also in the path."""
-        share = jnp.where(carry.time == 0, self.prior_error_share, 1)
-        error = share.astype(particles.energy.dtype) * particles.motion_error
-        particles = eqx.tree_at(lambda p: p.motion_error, particles, error)
-        if particles.path is None:
-            return particles
-        path = particles.path.at[:, carry.time].set(error)
-        return eqx.tree_at(lambda p: p.path, particles, path)
+
+def _remembered(particles: Particles, time: Int[Array, ""]) -> Particles:
+    """With the motion error in the path, where one is kept."""
+    if particles.path is None:
+        return particles
+    path = particles.path.at[:, time].set(particles.motion_error)
+    return eqx.tree_at(lambda p: p.path, particles, path)
+
+
+def _either(drawn: Drawn, particles: Particles) -> Particles:
+    """The settled particles and those of the filter; of sure ones those that agree."""
+    energy = jnp.where(drawn.sure, jnp.inf, particles.energy)
+    energy = jnp.concatenate([drawn.believed, energy])
+    T = [drawn.settled.T_target_source, particles.T_target_source]
+    out = Particles.at(jnp.concatenate(T), len(energy))
+    live = jnp.isfinite(energy)
+    size = jnp.sum(live).astype(energy.dtype)
+    log_weight = normalised(log_likelihood(energy, size), live)
+    return eqx.tree_at(lambda p: (p.energy, p.log_weight), out, (energy, log_weight))

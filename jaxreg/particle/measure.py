@@ -18,11 +18,12 @@ def measure(
     energy: AbstractEnergy,
     particles: Particles,
     T_predicted: Float[Array, "p D D"],
-    width: Scalar,
+    widths: tuple[Scalar, Scalar],
     *,
     num_rows: Int[Array, ""] | int,
     num_steps: Int[Array, ""] | int,
     batch_size: int,
+    first_row: Int[Array, ""] | int = 0,
 ) -> Particles:
     """Runs the local optimiser on particles (PF paper, section 3.3, steps 1, 2).
 
@@ -30,29 +31,33 @@ def measure(
         problem: the pair.
         optimiser: residual x kernel x step.
         energy: of the poses that it leads to.
-        particles: their poses, motion errors and energies are replaced.
-        T_predicted: `(p, d+1, d+1)` poses to start from; `batch_size` divides p.
-        width: kernel width of optimiser and energy.
-        num_rows: how many of them to measure, rounded up to full blocks; the energy of
-            the others is inf and their motion error zero.
+        particles: the motion errors and energies of those measured are replaced.
+        T_predicted: `(p, d+1, d+1)` poses to start from, which replace theirs;
+            `batch_size` divides p.
+        widths: kernel width of the first step and of the last, which is the energy's.
+        num_rows: how many of them to measure, rounded up to full blocks.
         num_steps: the paper's R.
         batch_size: particles in one vectorised block.
+        first_row: of those to measure.
     """
+    first, last = widths
 
     def one(T: Array) -> tuple[Array, Array, Array]:
-        T_measured = lax.fori_loop(
-            0, num_steps, lambda _, T: optimiser(problem, T, width), T
-        )
+        def step(i: Array, T: Array) -> Array:
+            share = i / jnp.maximum(num_steps - 1, 1)
+            width = first * (last / first) ** share.astype(T.dtype)
+            return optimiser(problem, T, width)
+
+        T_measured = lax.fori_loop(0, num_steps, step, T)
         error = decoupled_error(T_measured, T)
-        return T_measured, error, energy(match(problem, T_measured), width)
+        return T_measured, error, energy(match(problem, T_measured), last)
 
     def block(b: Array, out: tuple[Array, ...]) -> tuple[Array, ...]:
-        rows = b * batch_size + jnp.arange(batch_size)
+        rows = first_row + b * batch_size + jnp.arange(batch_size)
         found = jax.vmap(one)(T_predicted[rows])
         return jax.tree.map(lambda all_, new: all_.at[rows].set(new), out, found)
 
-    fresh = Particles.at(T_predicted, T_predicted.shape[0])
-    start = (T_predicted, fresh.motion_error, fresh.energy)
+    start = (T_predicted, particles.motion_error, particles.energy)
     found = lax.fori_loop(0, -(-num_rows // batch_size), block, start)
     return eqx.tree_at(
         lambda p: (p.T_target_source, p.motion_error, p.energy), particles, found

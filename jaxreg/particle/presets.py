@@ -53,6 +53,7 @@ def sandhu2010(
         prior_steps=R,
         inner_steps=R,
         refine_steps=0,
+        num_agreeing=0,
         num_points=num_points,
         prior=GaussianPrior(0.5, 0.5) if prior is None else prior,
         dynamics=StochasticDynamics() if dynamics is None else dynamics,

@@ -20,7 +20,7 @@ from jaxreg.local import (
 )
 
 
-# Clouds are padded to one size if that makes the smaller at most so many times as large.
+# Clouds are padded to one size where the larger is at most so many times as large.
 _MAX_PADDING = 2
 
 

@@ -88,7 +88,7 @@ def test_measurement_descends_and_reports_what_it_moved():
         energy,
         start,
         T,
-        width,
+        (width, width),
         num_rows=5,
         num_steps=5,
         batch_size=2,

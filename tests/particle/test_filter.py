@@ -34,6 +34,7 @@ from jaxreg.particle import (
     sandhu2010,
 )
 from jaxreg.particle.conclude import Pair, conclude
+from jaxreg.particle.draw import SETTLE_STEPS
 from jaxreg.particle.energies import AbstractEnergy
 from jaxreg.registration import register
 from jaxreg.robust import L2
@@ -87,6 +88,7 @@ def _small(**parts) -> ParticleFilter:
         "prior_steps": 2,
         "inner_steps": 2,
         "prior": GivenParticles(STARTS),
+        "num_agreeing": 0,
         "width_end": 0.3,
         "batch_size": 10,
     }
@@ -134,6 +136,34 @@ def test_without_dynamics_and_resampling_the_filter_is_multi_start():
     once = _search(_small(dynamics=NoDynamics(), tolerance=0.0), problem).particles
     assert np.ptp(found.particles.log_weight) > np.ptp(once.log_weight)
     assert np.sum(np.exp(found.particles.log_weight)) == pytest.approx(1, abs=1e-4)
+
+
+def test_draws_end_when_several_agree_and_not_on_a_symmetric_object():
+    method = ParticleFilter(num_prior=128, num_particles=16, batch_size=8)
+    points = blob(2 * N, 2) - blob(2 * N, 2).mean(0)
+    half = points[:N]
+    T = motion(5, 2, angle=2.0, shift=0.1)
+    ends = {}
+    for name, target in (
+        ("one", points),
+        ("alike from two sides", np.concatenate([half, -half])),
+    ):
+        source = _cloud(move(np.linalg.inv(T), target))
+        pair = _pair(2)
+        cloud = _cloud(target)
+        index = BruteForce.build(cloud.points)
+        ends[name] = _search(method, type(pair.problem).of(source, cloud, index))
+    sure, torn = ends["one"], ends["alike from two sides"]
+    drawn = method.prior_steps + SETTLE_STEPS
+    assert int(sure.num_steps) == drawn
+    assert bool(sure.finished)
+    angle, shift = pose_error(sure.particles.measurement, T)
+    assert angle < 0.05
+    assert shift < 0.05
+    # None of the 16 that the filter would have carried on, behind 32 settled ones.
+    assert not np.isfinite(sure.particles.energy[32:]).any()
+    assert int(torn.num_steps) > drawn
+    assert np.isfinite(torn.particles.energy).all()
 
 
 def _paper(d: int, dynamics: AbstractDynamics, num_times: int) -> ParticleFilter:
@@ -261,7 +291,7 @@ def test_settings_that_leave_nothing_to_do_are_refused(kind, field, value):
 
 
 def test_as_many_given_particles_as_the_method_starts_with():
-    with pytest.raises(ValueError, match="num_prior = 1024 poses, found 24"):
+    with pytest.raises(ValueError, match="num_prior = 1536 poses, found 24"):
         ParticleFilter(prior=GivenParticles(STARTS))
     with pytest.raises(ValueError, match="num_starts = 512 poses, found 24"):
         MultiStart(prior=GivenParticles(STARTS))
