@@ -4,6 +4,10 @@ Unknowns are left tangents around the current poses, T_world_i <- exp(x_i) T_wor
 poses are updated after each step, so they stay on the group. The error of an edge then
 depends on x_j - x_i alone, and the Gauss-Newton matrix is a graph Laplacian with k x k
 weights, which is never formed beyond blocks: conjugate gradients work on the edges.
+
+optimistix is not used: `LevenbergMarquardt` takes no preconditioner for J' J, and
+without one a step on sphere2500 had not converged after 2,000 rounds (12 s; here 20 to
+52 rounds, all steps in 0.4 s).
 """
 
 from collections.abc import Callable
@@ -27,7 +31,7 @@ from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
 from jaxreg.robust import AbstractKernel
 
 
-# A preconditioner is built anew when it takes so many times the rounds of its first use.
+# A preconditioner is built anew at so many times the rounds of its first use.
 _STALE = 2
 # Damping after the first refused step, and the least. There is none before: even 1e-9
 # of the diagonal holds back the bending of a long chain, so that steps converge slowly.
