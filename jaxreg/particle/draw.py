@@ -91,62 +91,86 @@ def draw_until_sure(
         batch_size: particles in one vectorised block, at most.
     """
     group, groups = _groups(num, batch_size)
-    batch_size = group // _BLOCKS
-    drawn = groups * group
-    buffer = T[jnp.arange(drawn + groups * batch_size) % len(T)]
-    row = jnp.arange(len(buffer))
-    counted = (row < num) | (row >= drawn)
+    drawing = _Drawing(problem, optimiser, energy, widths, num, num_steps, group)
     points = jnp.maximum(jnp.sum(problem.source_mask), 1).astype(T.dtype)
-
-    def phase(which: Array, state: tuple[Array, Particles]) -> tuple[Array, Particles]:
-        """Measures a group, then settles the best of it."""
-        number, particles = state
-        settling = which == 1
-        level = lax.dynamic_slice_in_dim(particles.energy, number * group, group)
-        least, best = lax.top_k(-level, batch_size)
-        chosen = particles.T_target_source[number * group + best]
-        home = drawn + number * batch_size
-        start = lax.dynamic_update_slice_in_dim(
-            particles.T_target_source, chosen, home, 0
-        )
-        out = measure(
-            problem,
-            optimiser,
-            energy,
-            particles,
-            start,
-            (widths[0], jnp.where(settling, widths[1], widths[0])),
-            first_row=jnp.where(settling, home, number * group),
-            num_rows=jnp.where(settling, batch_size, group),
-            num_steps=jnp.where(settling, SETTLE_STEPS, num_steps),
-            batch_size=batch_size,
-        )
-        found = jnp.where(jnp.isfinite(out.energy) & counted, out.energy, jnp.inf)
-        # A block is settled in full, also where fewer were drawn.
-        settled = lax.dynamic_slice_in_dim(found, home, batch_size)
-        settled = jnp.where(settling & jnp.isinf(least), jnp.inf, settled)
-        found = lax.dynamic_update_slice_in_dim(found, settled, home, 0)
-        return number, eqx.tree_at(lambda p: p.energy, out, found)
+    drawn = groups * group
 
     def body(state: tuple[Array, Particles, Array]) -> tuple[Array, Particles, Array]:
         number, particles, _ = state
-        _, particles = lax.fori_loop(0, 2, phase, (number, particles))
+        particles = drawing.next_group(number, particles)
         settled = particles.rows(slice(drawn, None))
         return number + 1, particles, _agree(settled, num_agreeing, points)
 
+    rows = jnp.arange(drawn + drawn // _BLOCKS) % len(T)
     _, particles, sure = lax.while_loop(
         lambda state: (state[0] < groups) & ~state[2],
         body,
-        (jnp.zeros((), jnp.int32), Particles.at(buffer, num), jnp.asarray(False)),
+        (jnp.zeros((), jnp.int32), Particles.at(T[rows], num), jnp.asarray(False)),
     )
     # As many rows as there were poses, also where that is more than were to be drawn.
     row = jnp.arange(len(T))
     first = particles.rows(jnp.minimum(row, drawn - 1))
-    energy = jnp.where(row < num, first.energy, jnp.inf)
-    first = eqx.tree_at(lambda p: p.energy, first, energy)
+    first = first.valued(jnp.where(row < num, first.energy, jnp.inf))
     settled = particles.rows(slice(drawn, None))
     away = sure & ~_near(settled, jnp.argmin(settled.energy), _APART)
     return Drawn(first, settled, jnp.where(away, jnp.inf, settled.energy), sure)
+
+
+class _Drawing(eqx.Module):
+    """What is done with each group.
+
+    The particles are those to draw, in groups, and behind them a block for the settled
+    of each group. `num` of those to draw count; the others fill the last group.
+    """
+
+    problem: Problem
+    optimiser: LocalOptimiser
+    energy: AbstractEnergy
+    widths: tuple[Scalar, Scalar]
+    num: int = eqx.field(static=True)
+    num_steps: int = eqx.field(static=True)
+    group: int = eqx.field(static=True)
+
+    def next_group(self, number: Int[Array, ""], particles: Particles) -> Particles:
+        """With that group measured, and the best of it settled."""
+
+        def phase(which: Array, particles: Particles) -> Particles:
+            return self._phase(which == 1, number, particles)
+
+        # One loop compiles the measurement once.
+        return lax.fori_loop(0, 2, phase, particles)
+
+    def _phase(
+        self, settling: Bool[Array, ""], number: Int[Array, ""], particles: Particles
+    ) -> Particles:
+        block = self.group // _BLOCKS
+        drawn = particles.energy.size * _BLOCKS // (_BLOCKS + 1)
+        group, home = number * self.group, drawn + number * block
+        measured = lax.dynamic_slice_in_dim(particles.energy, group, self.group)
+        best = lax.top_k(-measured, block)[1]
+        T = particles.T_target_source
+        start = lax.dynamic_update_slice_in_dim(T, T[group + best], home, 0)
+        first, last = self.widths
+        out = measure(
+            self.problem,
+            self.optimiser,
+            self.energy,
+            particles,
+            start,
+            (first, jnp.where(settling, last, first)),
+            first_row=jnp.where(settling, home, group),
+            num_rows=jnp.where(settling, block, self.group),
+            num_steps=jnp.where(settling, SETTLE_STEPS, self.num_steps),
+            batch_size=block,
+        )
+        row = jnp.arange(out.energy.size)
+        counts = (row < self.num) | (row >= drawn)
+        energy = jnp.where(counts & jnp.isfinite(out.energy), out.energy, jnp.inf)
+        # A block is settled in full, also where fewer were drawn.
+        settled = lax.dynamic_slice_in_dim(energy, home, block)
+        surplus = settling & jnp.isinf(measured[best])
+        settled = jnp.where(surplus, jnp.inf, settled)
+        return out.valued(lax.dynamic_update_slice_in_dim(energy, settled, home, 0))
 
 
 def _agree(

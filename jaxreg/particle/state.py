@@ -57,6 +57,10 @@ class Particles(eqx.Module):
         """The same with other weights."""
         return eqx.tree_at(lambda p: p.log_weight, self, log_weight)
 
+    def valued(self, energy: Float[Array, " p"]) -> "Particles":
+        """The same with other energies."""
+        return eqx.tree_at(lambda p: p.energy, self, energy)
+
     @property
     def measurement(self) -> Motion:
         """z_t: the pose of least energy (PF paper, section 3.3, step 4)."""
