@@ -51,7 +51,7 @@ class MultiStart(AbstractSearch):
     Gradients: none; refine with `ICP` from the answer to differentiate it.
     """
 
-    num_starts: int = eqx.field(default=512, static=True)
+    num_starts: int = eqx.field(default=672, static=True)
     num_steps: int = eqx.field(default=27, static=True)
     refine_steps: int = eqx.field(default=24, static=True)
     num_points: int = eqx.field(default=400, static=True)

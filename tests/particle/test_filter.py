@@ -293,7 +293,7 @@ def test_settings_that_leave_nothing_to_do_are_refused(kind, field, value):
 def test_as_many_given_particles_as_the_method_starts_with():
     with pytest.raises(ValueError, match="num_prior = 1536 poses, found 24"):
         ParticleFilter(prior=GivenParticles(STARTS))
-    with pytest.raises(ValueError, match="num_starts = 512 poses, found 24"):
+    with pytest.raises(ValueError, match="num_starts = 672 poses, found 24"):
         MultiStart(prior=GivenParticles(STARTS))
 
 
