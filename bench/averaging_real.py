@@ -136,14 +136,6 @@ def angles(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def right_share(
-    T: np.ndarray, T_true: np.ndarray, known: np.ndarray, degrees: float, metres: float
-) -> float:
-    """The share of frames that are right in the best common frame."""
-    turn, shift = frame_errors(T, T_true, known, degrees, metres)
-    return float(((turn < degrees) & (shift < metres) & known).mean())
-
-
 def joined(
     graph: PoseGraph,
     T_true: np.ndarray,
@@ -228,9 +220,9 @@ def table(title: str, cases: dict, degrees: float, metres: float) -> None:
         times.append(spent)
         print(f"{name:40}" + "".join(f"{x:24.3f}" for x in row))
         print(f"{'':40}" + "".join(f"{x:>24}" for x in details), flush=True)
-    mean, best = np.mean(shares, axis=0), np.median(times, axis=0)
+    mean, middle = np.mean(shares, axis=0), np.median(times, axis=0)
     print(f"{'mean':40}" + "".join(f"{x:24.3f}" for x in mean))
-    print(f"{'ms, median':40}" + "".join(f"{1e3 * x:24.1f}" for x in best))
+    print(f"{'ms, median':40}" + "".join(f"{1e3 * x:24.1f}" for x in middle))
 
 
 def main() -> None:

@@ -144,7 +144,7 @@ def large(num: int, outliers: float, single: bool, seed: int) -> None:
     methods = {"PoseGraphLM": PoseGraphLM()} if outliers == 0 else {}
     for name, method in {**methods, "Correntropy": Correntropy()}.items():
 
-        def call(method=method):  # noqa: ANN001, ANN202
+        def call(method=method):
             return jax.block_until_ready(average(graph, method))
 
         first = timed(call).wall

@@ -7,8 +7,7 @@ least energy and every settled particle elsewhere is worse by more than chance: 
 sequential test (Wald 1945). An object that looks the same from two sides keeps finding
 two poses, and a wrong pose is rarely found twice, so both go on to the filter.
 
-Pairs of real scans with an overlap of 0.3 and more are mostly sure after 130 to 260
-draws; of 69 that overlap less than 0.1, and of boxes and cylinders, none ever was.
+The constants were chosen on pairs of real scans, horses, boxes and cylinders.
 """
 
 import equinox as eqx

@@ -194,7 +194,7 @@ class ParticleFilter(AbstractSearch):
     def _draw(
         self, problem: Problem, optimiser: LocalOptimiser, T: Float[Array, "p D D"]
     ) -> Drawn:
-        """T = 0: the prior, measured and weighed."""
+        """The prior at t = 0, measured and weighed."""
         start, end = (jnp.asarray(x) for x in (self.width_start, self.width_end))
         batch = min(self.batch_size, self.num_prior)
         if self._settles:
@@ -227,12 +227,9 @@ class ParticleFilter(AbstractSearch):
         error = self.prior_error_share * particles.motion_error
         particles = eqx.tree_at(lambda p: p.motion_error, particles, error)
         if self.dynamics.needs_path:
-            shape = (*error.shape[:1], self.num_times + 1, *error.shape[1:])
+            path = Particles.at(T, self.num_prior, self.num_times + 1).path
             particles = eqx.tree_at(
-                lambda p: p.path,
-                particles,
-                jnp.zeros(shape, error.dtype),
-                is_leaf=lambda x: x is None,
+                lambda p: p.path, particles, path, is_leaf=lambda x: x is None
             )
         particles = _remembered(particles, jnp.zeros((), jnp.int32))
         return eqx.tree_at(lambda d: d.particles, drawn, particles)

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from jaxreg import Status
 from jaxreg._core.arrays import traced
 from jaxreg.cloud import PointCloud
-from jaxreg.local import LocalOptimiser, match
+from jaxreg.local import LocalOptimiser, Problem, match
 from jaxreg.neighbours import BruteForce
 from jaxreg.particle import (
     AbsoluteEnergy,
@@ -149,10 +149,9 @@ def test_draws_end_when_several_agree_and_not_on_a_symmetric_object():
         ("alike from two sides", np.concatenate([half, -half])),
     ):
         source = _cloud(move(np.linalg.inv(T), target))
-        pair = _pair(2)
         cloud = _cloud(target)
-        index = BruteForce.build(cloud.points)
-        ends[name] = _search(method, type(pair.problem).of(source, cloud, index))
+        problem = Problem.of(source, cloud, BruteForce.build(cloud.points))
+        ends[name] = _search(method, problem)
     sure, torn = ends["one"], ends["alike from two sides"]
     drawn = method.prior_steps + SETTLE_STEPS
     assert int(sure.num_steps) == drawn
