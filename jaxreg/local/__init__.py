@@ -18,6 +18,7 @@ from jaxreg.local.residuals import PointToPlane as PointToPlane
 from jaxreg.local.residuals import PointToPoint as PointToPoint
 from jaxreg.local.residuals import Symmetric as Symmetric
 from jaxreg.local.score import Score as Score
+from jaxreg.local.score import mutual_overlap as mutual_overlap
 from jaxreg.local.score import score as score
 from jaxreg.local.score import score_both_ways as score_both_ways
 from jaxreg.local.steps import AbstractStep as AbstractStep

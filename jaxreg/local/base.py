@@ -98,7 +98,8 @@ class RegistrationSolution(eqx.Module):
         inlier_rmse: root mean square distance of that share to the target's tangent
             planes, in the unit of the input.
         num_inliers: int32, points of the (thinned) source in that share.
-        overlap: the lesser of the shares of source and target that lie on the other.
+        overlap: geometric mean of the shares of source and target that lie on the
+            other, at most twice the lesser.
         num_steps: int32, steps of the local optimiser along the winning path.
         H: `(k, k)` Gauss-Newton matrix of the weighted energy of the last step, for a
             tangent (v, w), translation first: R -> exp(w) R, c -> c + v, where c is

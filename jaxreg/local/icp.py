@@ -24,7 +24,7 @@ from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.problem import Match, Problem, match
 from jaxreg.local.residuals import AbstractResidual, PlaneToPlane
 from jaxreg.local.scale import fit_scale
-from jaxreg.local.score import score, score_match
+from jaxreg.local.score import mutual_overlap, score, score_match
 from jaxreg.local.steps import AbstractStep, GaussNewton, GradientDescent
 from jaxreg.neighbours import AbstractIndex, BruteForce, index_within
 from jaxreg.robust import AbstractKernel, GemanMcClure
@@ -151,7 +151,7 @@ class ICP(AbstractRegistrar):
             fitness=there.fitness,
             inlier_rmse=there.inlier_rmse,
             num_inliers=there.num_inliers,
-            overlap=jnp.minimum(there.fitness, back),
+            overlap=mutual_overlap(there.fitness, back),
             num_steps=end.num_steps,
             H=curvature.H,
             b=curvature.b,

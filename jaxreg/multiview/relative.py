@@ -16,7 +16,7 @@ class RelativeMotions(eqx.Module):
 
     Attributes:
         T_i_j: `(e, d+1, d+1)`.
-        overlap: `(e,)` lesser share of either scan that lies on the other.
+        overlap: `(e,)` see `RegistrationSolution`.
         inlier_rmse: `(e,)` in units of the common radius.
         status: `(e,)` int32.
     """

@@ -25,6 +25,7 @@ from jaxreg.local import (
     RegistrationSolution,
     Score,
     match,
+    mutual_overlap,
     score_both_ways,
 )
 from jaxreg.neighbours import AbstractIndex
@@ -70,11 +71,11 @@ class Pair(eqx.Module):
     def scores(
         self, T: Float[Array, "q D D"], spacing: Scalar
     ) -> tuple[Score, Float[Array, " q"]]:
-        """Of the source on the target at poses, and the lesser share of both ways."""
+        """Of the source on the target at poses, and the overlap."""
         there, back = score_both_ways(
             self.source, self.target, self.source_index, self.target_index, T, spacing
         )
-        return there, jnp.minimum(there.fitness, back.fitness)
+        return there, mutual_overlap(there.fitness, back.fitness)
 
 
 def conclude(
@@ -100,7 +101,7 @@ def conclude(
         refine_steps: steps on all points; the modes are then ordered by the overlap
             that they reach. Without, by energy: the answer is the particle of least
             energy.
-        min_overlap: share of both clouds that must agree.
+        min_overlap: least overlap of a pose that is believed.
     """
     dtype = particles.energy.dtype
     limit = jnp.asarray(_APART, dtype)

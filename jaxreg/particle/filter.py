@@ -92,14 +92,13 @@ class ParticleFilter(AbstractSearch):
         width_start, width_end: kernel width at t = 0 and at t = num_times.
         tolerance: the filter stops when no particle's motion error exceeds this many
             radians and radii: then the diffusion has died.
-        min_overlap: share of both clouds that must agree for a pose to be believed.
+        min_overlap: least overlap of a pose that is believed.
 
     Raises: ValueError while constructing, for counts that leave nothing to do.
 
     Fails: TOO_FEW_POINTS; NON_FINITE where no energy is finite; LOW_OVERLAP where the
-    best pose is supported by less than `min_overlap` of either cloud; AMBIGUOUS where a
-    second mode is nearly as good; without refinement MAX_STEPS where the diffusion had
-    not died.
+    overlap is below `min_overlap`; AMBIGUOUS where a second mode is nearly as good;
+    without refinement MAX_STEPS where the diffusion had not died.
 
     Gradients: none; refine with `ICP` from the answer to differentiate it.
     """
@@ -127,7 +126,7 @@ class ParticleFilter(AbstractSearch):
     width_start: Array | float = traced(0.3)
     width_end: Array | float = traced(0.06)
     tolerance: Array | float = traced(1e-4)
-    min_overlap: Array | float = traced(0.12)
+    min_overlap: Array | float = traced(0.14)
 
     def __check_init__(self) -> None:
         """Refuses counts that leave nothing to do."""

@@ -42,7 +42,7 @@ class MultiStart(AbstractSearch):
         width_start, width_end: kernel width at the first and at the last step.
         tolerance: descents have come to rest where the last step moves none by more
             than this many radians and radii.
-        min_overlap: share of both clouds that must agree for a pose to be believed.
+        min_overlap: least overlap of a pose that is believed.
 
     Raises: ValueError while constructing, for counts that leave nothing to do.
 
@@ -66,7 +66,7 @@ class MultiStart(AbstractSearch):
     width_start: Array | float = traced(0.3)
     width_end: Array | float = traced(0.06)
     tolerance: Array | float = traced(1e-4)
-    min_overlap: Array | float = traced(0.12)
+    min_overlap: Array | float = traced(0.14)
 
     def __check_init__(self) -> None:
         """Refuses counts that leave nothing to do."""
