@@ -12,12 +12,14 @@ from helpers import blob, motion, move, pose_error
 import jaxreg as jr
 from jaxreg import Status
 from jaxreg.cloud import PointCloud
+from jaxreg.datasets import sculpture_scans
 from jaxreg.local import AbstractRegistrar, Modes, RegistrationSolution
 from jaxreg.registration import many
 from jaxreg.robust import L1, L2
 
 
 N, M = 500, 800
+KEY = jax.random.key(0)
 FILTER = jr.ParticleFilter(
     num_prior=256, num_particles=32, num_times=4, num_points=128, num_modes=2
 )
@@ -51,6 +53,36 @@ def test_default_method_finds_a_partial_overlap():
     angle, shift = pose_error(sol.T_target_source, T)
     assert angle < 0.04
     assert shift < 0.06
+
+
+def _tenth(points: np.ndarray, seed: int) -> np.ndarray:
+    """The tenth nearest to one of them."""
+    order = np.argsort(np.sum((points - points[seed]) ** 2, axis=1))
+    return points[order[: len(points) // 10]]
+
+
+def test_a_tenth_of_an_object_is_found_in_the_whole():
+    scans, T_world_i = sculpture_scans(12, seed=0)
+    points = np.concatenate(
+        [move(T, np.asarray(x)) for T, x in zip(T_world_i, scans, strict=True)]
+    )
+    points = np.random.default_rng(0).permutation(points)[: M + 10 * N]
+    for seed in (2, 4, 5):
+        T = motion(seed, 3)
+        source = move(np.linalg.inv(T), _tenth(points[M:], seed))
+        sol = jr.register(source, points[:M], key=jax.random.key(seed))
+        assert int(sol.status) == Status.CONVERGED
+        angle, shift = pose_error(sol.T_target_source, T)
+        assert angle < 0.03
+        assert shift < 0.03  # the object is 0.2 wide, the motion some metres
+
+
+def test_a_patch_of_a_smooth_surface_is_ambiguous():
+    target = blob(M, 3, seed=2)
+    for seed in (0, 3):
+        sol = jr.register(_tenth(blob(10 * N, 3, 7), seed), target, key=KEY)
+        assert int(sol.status) == Status.AMBIGUOUS
+        assert np.sum(np.asarray(sol.modes.weight) > 0.1) > 1
 
 
 PLANE = jr.ICP()

@@ -36,8 +36,9 @@ from jaxreg.robust import AbstractKernel
 
 # Poses nearer than this, in radians and radii, are one mode.
 _APART = 0.3
-# A second mode with more than this share of the overlap of the first is its rival.
-_RIVAL = 0.95
+# A second mode is a rival of the first if its overlap is more than this share of the
+# first's, or its weight: by chance alone, two standard errors.
+_RIVAL_OVERLAP, _RIVAL_WEIGHT = 0.95, 0.13
 # Steps of the most accurate residual, where it is close already.
 _POLISH = 8
 
@@ -120,14 +121,19 @@ def conclude(
     # Refinement may lead two of them to one pose.
     first = first_within(T_modes, angle=limit, distance=limit)
     overlap = jnp.where(first == jnp.arange(num_modes), overlap, -1)
-    if refine_steps:
-        mass = _weights(overlap, pair)
+    weight = _weights(overlap, pair)
+    mass = weight if refine_steps else mass
     steps = _POLISH if refine_steps else 0
     T_modes, curvatures = _polished(
         pair.problem, kernel, T_modes, overlap >= 0, 0.5 * spacing, steps
     )
     best, curvature = jax.tree.map(lambda x: x[0], (there, curvatures))
-    status = _status(overlap, pair, min_overlap, finished | (refine_steps > 0))
+    rival = (overlap[1:] > _RIVAL_OVERLAP * overlap[0]) | (
+        weight[1:] > _RIVAL_WEIGHT * weight[0]
+    )
+    status = _status(
+        overlap[0], jnp.any(rival), pair, min_overlap, finished | (refine_steps > 0)
+    )
     return RegistrationSolution(
         T_target_source=T_modes[0],
         status=status,
@@ -225,18 +231,17 @@ def _of_used(
 
 
 def _status(
-    overlap: Float[Array, " q"],
+    overlap: Float[Array, ""],
+    rivalled: Bool[Array, ""],
     pair: Pair,
     min_overlap: Array | float,
     finished: Bool[Array, ""],
 ) -> Int[Array, ""]:
-    """Of modes with the answer first; an overlap of -1 marks one that is none."""
+    """Of the answer; an overlap of -1 marks one that is no mode."""
     status = jnp.where(finished, Status.CONVERGED, Status.MAX_STEPS)
-    if overlap.shape[0] > 1:
-        rival = jnp.max(overlap[1:]) > _RIVAL * overlap[0]
-        status = jnp.where(rival, Status.AMBIGUOUS, status)
-    status = jnp.where(overlap[0] < min_overlap, Status.LOW_OVERLAP, status)
-    status = jnp.where(overlap[0] < 0, Status.NON_FINITE, status)
+    status = jnp.where(rivalled, Status.AMBIGUOUS, status)
+    status = jnp.where(overlap < min_overlap, Status.LOW_OVERLAP, status)
+    status = jnp.where(overlap < 0, Status.NON_FINITE, status)
     d = pair.source.points.shape[1]
     few = jnp.minimum(jnp.sum(pair.source.mask), jnp.sum(pair.target.mask)) < d + 1
     return jnp.where(few, Status.TOO_FEW_POINTS, status).astype(jnp.int32)
