@@ -16,9 +16,9 @@ from jaxreg.averaging.evidence import redundancy
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, precisions
 from jaxreg.averaging.iterate import Iterated
 from jaxreg.averaging.posegraph_lm import (
+    LOG_ERROR,
     Minimum,
     Problem,
-    log_error,
     minimise,
     robust_problem,
 )
@@ -106,7 +106,7 @@ def graduated(
 
 def _problem(graph: PoseGraph, parts: Array, width: Array) -> Problem:
     W = precisions(graph, jnp.ones_like(graph.weight), parts)
-    return robust_problem(graph, log_error, W, Correntropy(), width)
+    return robust_problem(graph, LOG_ERROR, W, Correntropy(), width)
 
 
 def _before(graph: PoseGraph, T_start: Array) -> _State:

@@ -19,53 +19,61 @@ class _State(NamedTuple):
     x: Array
     r: Array
     p: Array
+    Ap: Array
+    curvature: Array
     rz: Array
+    stop: Array
     step: Array
 
 
 def conjugate_gradients(
     apply: _Linear,
     precondition: _Linear,
-    rhs: Float[Array, "v k"],
+    rhs: Float[Array, "v k c"],
     *,
-    columns: bool,
     tolerance: float | Array,
     max_steps: int,
-) -> tuple[Float[Array, "v k"], Int[Array, ""]]:
+) -> tuple[Float[Array, "v k c"], Int[Array, ""]]:
     """Solves `apply(x) = rhs` for a positive semidefinite map and a rhs in its range.
 
+    Directions are made conjugate to the last one explicitly, so that the preconditioner
+    may itself be an iteration, not quite linear.
+
     Args:
-        apply: the map.
+        apply: the map; treats the c columns alike and apart.
         precondition: about its inverse, positive semidefinite.
-        rhs: the right-hand side.
-        columns: True if the map treats the k columns alike and apart, so that each has
-            its own steps; False if it mixes them.
-        tolerance: stop when the residual, in the norm of the preconditioner, is below
-            this share of its first value.
+        rhs: right-hand sides; each has its own steps.
+        tolerance: the last step is the one before which the residual, in the norm of
+            the preconditioner, is below this share of its first value.
         max_steps: largest number of steps.
 
     Returns:
-        The solution and the number of steps.
+        The solutions and the number of steps.
     """
-    axis = 0 if columns else None
-    z = precondition(rhs)
-    rz = jnp.sum(rhs * z, axis=axis)
-    stop = jnp.maximum(tolerance**2 * rz, jnp.finfo(rhs.dtype).tiny)
+
+    def dot(a: Array, b: Array) -> Array:
+        return jnp.sum(a * b, axis=(0, 1))
 
     def unfinished(s: _State) -> Array:
-        return jnp.any(s.rz > stop) & (s.step < max_steps)
+        return jnp.any(s.rz > s.stop) & (s.step < max_steps)
 
     def step(s: _State) -> _State:
-        Ap = apply(s.p)
-        pAp = jnp.sum(s.p * Ap, axis=axis)
-        alive = (pAp > 0) & (s.rz > stop)
-        a = jnp.where(alive, s.rz / jnp.where(alive, pAp, 1), 0)
-        x, r = s.x + a * s.p, s.r - a * Ap
-        z = precondition(r)
-        rz = jnp.where(alive, jnp.sum(r * z, axis=axis), 0)
-        beta = jnp.where(alive, rz / jnp.where(alive, s.rz, 1), 0)
-        return _State(x, r, z + beta * s.p, rz, s.step + 1)
+        z = precondition(s.r)
+        rz = dot(s.r, z)
+        stop = jnp.where(s.step == 0, tolerance**2 * rz, s.stop)
+        curved = s.curvature > 0
+        beta = jnp.where(curved, -dot(z, s.Ap) / jnp.where(curved, s.curvature, 1), 0)
+        p = z + beta * s.p
+        Ap = apply(p)
+        curvature = dot(p, Ap)
+        alive = (curvature > 0) & (rz > 0) & (s.rz > s.stop)
+        a = jnp.where(alive, rz / jnp.where(alive, curvature, 1), 0)
+        rz = jnp.where(alive, rz, 0)
+        return _State(s.x + a * p, s.r - a * Ap, p, Ap, curvature, rz, stop, s.step + 1)
 
-    begin = _State(jnp.zeros_like(rhs), rhs, z, rz, jnp.asarray(0, jnp.int32))
+    zero, none = jnp.zeros_like(rhs), jnp.zeros(rhs.shape[-1:], rhs.dtype)
+    begin = _State(
+        zero, rhs, zero, zero, none, none + jnp.inf, none, jnp.asarray(0, jnp.int32)
+    )
     end = jax.lax.while_loop(unfinished, step, begin)
     return end.x, end.step

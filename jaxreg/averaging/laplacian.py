@@ -5,21 +5,18 @@ weighted incidence matrix, so its least-squares solution needs the v x v Laplaci
 B' B with k right-hand sides and never a k v x k v matrix. Frame 0 is held at 0.
 
 Up to `DENSE_LIMIT` frames the matrix is formed; above, conjugate gradients work on the
-edges, preconditioned by two levels (`two_level`). Numbering frames along the trajectory
-helps them; any numbering is right.
+edges, preconditioned by a multigrid cycle. Any numbering of frames is right.
 """
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxreg.averaging.krylov import conjugate_gradients
-from jaxreg.averaging.two_level import two_level
+from jaxreg.averaging.multigrid import anchored, multigrid
 
 
 #: Largest number of frames for which a dense matrix over frames is formed.
 DENSE_LIMIT = 128
-# Frames in a block, at least between nodes of the coarse system, and nodes at most.
-_BLOCK, _SPACING, _NODES = 32, 16, 1500
 
 
 def divergence(
@@ -77,21 +74,14 @@ def _conjugate_gradients(
     edges: Array, weight: Array, rhs: Array, tolerance: float
 ) -> Array:
     """Preconditioned conjugate gradients, the k columns side by side."""
-    num_poses = rhs.shape[0]
-    i, j = edges[:, 0], edges[:, 1]
-    spacing = max(_SPACING, -(-num_poses // _NODES))
-    inverse = two_level(edges, weight[:, None, None], num_poses, _BLOCK, spacing)
-
-    def apply(x: Array) -> Array:
-        return (
-            divergence(edges, weight[:, None] * (x[j] - x[i]), num_poses).at[0].set(0)
-        )
-
-    return conjugate_gradients(
-        apply,
-        lambda r: inverse(r[:, None, :])[:, 0, :],
-        rhs,
-        columns=True,
+    matrix = anchored(edges, weight[:, None, None], rhs.shape[0])
+    # What arrives at frame 0 leaves the others.
+    rhs = rhs.at[0].set(-jnp.sum(rhs, axis=0))
+    x = conjugate_gradients(
+        matrix,
+        multigrid(matrix),
+        rhs[:, None, :],
         tolerance=max(tolerance, 3 * float(jnp.finfo(rhs.dtype).eps)),
         max_steps=500,
-    )[0]
+    )[0][:, 0]
+    return x.at[0].set(0)

@@ -21,11 +21,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
-from jaxreg.averaging.block_system import block_inverse, solve_block_flow
+from jaxreg.averaging.block_system import solve_block_flow
 from jaxreg.averaging.iterate import nearby_rotation
+from jaxreg.averaging.multigrid import Multigrid, anchored, matmul, multigrid
 from jaxreg.averaging.plain import MotionAveraging
 from jaxreg.averaging.tree import start
-from jaxreg.averaging.two_level import TwoLevel
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
 from jaxreg.robust import AbstractKernel
@@ -97,33 +97,40 @@ class PoseGraphLM(AbstractAverager):
 
     def _problem(self, graph: PoseGraph) -> "Problem":
         if self.objective == "chordal":
-            error, precision = _chordal_error, _chordal_precision(graph)
+            error, precision = _CHORDAL, _chordal_precision(graph)
         else:
-            error, precision = log_error, _log_precision(graph)
+            error, precision = LOG_ERROR, _log_precision(graph)
         if self.kernel is None:
             return Problem(graph, error, precision, lambda s: s, jnp.ones_like)
         width = jnp.asarray(self.kernel_width)
         return robust_problem(graph, error, precision, self.kernel, width)
 
 
+class EdgeError(NamedTuple):
+    """The error of predicted motions `(e, D, D)`."""
+
+    value: Callable[[Array, Array], Array]  # (e, m), given the measured ones, too
+    jacobian: Callable[[Array, Array], Array]  # (e, m, k) to right tangents, given both
+
+
 class Problem(NamedTuple):
     """The sum of loss(r' Omega r) over the edges; trust is its derivative."""
 
     graph: PoseGraph
-    error: Callable[[Array, Array], Array]
+    error: EdgeError
     precision: Array  # (e, m, m), or (e, m) if diagonal
     loss: Callable[[Array], Array]
     trust: Callable[[Array], Array]
 
     def squares(self, T: Array) -> Array:
         """The squared error r' Omega r of each edge."""
-        r = self.error(_predicted(self.graph, T), self.graph.T_i_j)
+        r = self.error.value(_predicted(self.graph, T), self.graph.T_i_j)
         return jnp.sum(r * self._weighted(r[..., None])[..., 0], axis=-1)
 
     def _weighted(self, J: Array) -> Array:
         if self.precision.ndim == 2:
             return self.precision[..., None] * J
-        return product(self.precision, J)
+        return matmul(self.precision, J)
 
     def cost(self, T: Array) -> Array:
         """The objective."""
@@ -132,25 +139,21 @@ class Problem(NamedTuple):
     def normal(self, T: Array) -> tuple[Array, Array]:
         """J' Omega J `(e, k, k)` and J' Omega r `(e, k)` with respect to x_j - x_i."""
         i, j = self.graph.edges[:, 0], self.graph.edges[:, 1]
-        T_i_world = lie.inverse(T)[i]
-        predicted = product(T_i_world, T[j])
-
-        def along(generator: Array) -> tuple[Array, Array]:
-            moved = product(product(T_i_world, generator[None]), T[j])
-            return jax.jvp(
-                lambda P: self.error(P, self.graph.T_i_j), (predicted,), (moved,)
-            )
-
-        r, J = jax.vmap(along, out_axes=(None, -1))(_generators(T))
-        trust = self.trust(self.squares(T))[:, None, None]
-        WJ = trust * self._weighted(J)
-        Q = product(jnp.swapaxes(J, -1, -2), WJ)
-        return Q, jnp.sum(WJ * r[:, :, None], axis=-2)
+        T_i_world = lie.inverse(T)
+        predicted = product(T_i_world[i], T[j])
+        r = self.error.value(predicted, self.graph.T_i_j)
+        # A left tangent of both ends turns the predicted motion from the right.
+        J = matmul(self.error.jacobian(predicted, r), lie.adjoint(T_i_world)[j])
+        WJ = self._weighted(J)
+        force = jnp.sum(WJ * r[:, :, None], axis=-2)
+        trust = self.trust(jnp.sum(r * self._weighted(r[..., None])[..., 0], axis=-1))
+        Q = matmul(jnp.swapaxes(J, -1, -2), trust[:, None, None] * WJ)
+        return Q, trust[:, None] * force
 
 
 def robust_problem(
     graph: PoseGraph,
-    error: Callable[[Array, Array], Array],
+    error: EdgeError,
     precision: Float[Array, "e ..."],
     kernel: AbstractKernel,
     width: Float[Array, ""],
@@ -184,8 +187,8 @@ def minimise(
     limit = jnp.maximum(tolerance, 4 * jnp.finfo(cost.dtype).eps)
     zero, inf = jnp.zeros_like(cost), jnp.full_like(cost, jnp.inf)
     inverse = jax.eval_shape(
-        lambda: block_inverse(
-            graph.edges, problem.normal(T_start)[0], graph.num_poses, zero
+        lambda: multigrid(
+            anchored(graph.edges, problem.normal(T_start)[0], graph.num_poses, zero)
         )
     )
     begin = _State(
@@ -210,7 +213,7 @@ class _State(NamedTuple):
     T: Array
     cost: Array
     damping: Array
-    inverse: TwoLevel  # of the normal equations at this or an earlier step
+    inverse: Multigrid  # of the normal equations at this or an earlier step
     usual: Array  # rounds that it first took, 0 where it is to be built
     gain: Array  # share of the cost that the last step took away
     next_gain: Array  # what the next one is expected to
@@ -221,16 +224,12 @@ def _predicted(graph: PoseGraph, T: Array) -> Array:
     return product(lie.inverse(T)[graph.edges[:, 0]], T[graph.edges[:, 1]])
 
 
-def _generators(T: Array) -> Array:
-    """The derivative of exp at 0 along each tangent coordinate, `(k, D, D)`."""
-    k = lie.tangent_dim(T.shape[-1] - 1)
-    zero = jnp.zeros((k,), T.dtype)
-    return jnp.moveaxis(jax.jacfwd(lie.exp)(zero), -1, 0)
-
-
-def log_error(predicted: Array, T_i_j: Array) -> Array:
-    """The tangent error of g2o and GTSAM."""
+def _log_error(predicted: Array, T_i_j: Array) -> Array:
     return lie.log(product(lie.inverse(T_i_j), predicted))
+
+
+#: The tangent error of g2o and GTSAM.
+LOG_ERROR = EdgeError(_log_error, lambda _, r: lie.log_jacobian(r))
 
 
 def _log_precision(graph: PoseGraph) -> Array:
@@ -241,10 +240,20 @@ def _log_precision(graph: PoseGraph) -> Array:
     return graph.weight[:, None, None] * info
 
 
-def _chordal_error(predicted: Array, T_i_j: Array) -> Array:
-    gap = (predicted - T_i_j)[:, :-1]
-    rotation = gap[..., :-1].reshape(gap.shape[0], -1)
-    return jnp.concatenate([rotation, gap[..., -1]], axis=-1)
+def _entries(T: Array) -> Array:
+    """The entries of motions or their changes, rotation first."""
+    rotation, shift = T[..., :-1, :-1], T[..., :-1, -1]
+    return jnp.concatenate([rotation.reshape(*shift.shape[:-1], -1), shift], axis=-1)
+
+
+def _chordal_jacobian(predicted: Array, _: Array) -> Array:
+    k = lie.tangent_dim(predicted.shape[-1] - 1)
+    generators = jax.jacfwd(lie.exp)(jnp.zeros((k,), predicted.dtype))
+    moved = product(predicted[:, None], jnp.moveaxis(generators, -1, 0)[None])
+    return jnp.swapaxes(_entries(moved), -1, -2)
+
+
+_CHORDAL = EdgeError(lambda P, T_i_j: _entries(P - T_i_j), _chordal_jacobian)
 
 
 def _chordal_precision(graph: PoseGraph) -> Array:
@@ -258,14 +267,9 @@ def _try_step(problem: Problem, s: _State) -> _State:
     """One damped step, kept if it lowers the cost."""
     Q, force = problem.normal(s.T)
     graph = problem.graph
-    inverse = jax.lax.cond(
-        s.usual > 0,
-        lambda: s.inverse,
-        lambda: block_inverse(graph.edges, Q, graph.num_poses, s.damping),
-    )
-    x, rounds = solve_block_flow(
-        graph.edges, Q, force, inverse, s.damping, tolerance=1e-2
-    )
+    matrix = anchored(graph.edges, Q, graph.num_poses, s.damping)
+    inverse = jax.lax.cond(s.usual > 0, lambda: s.inverse, lambda: multigrid(matrix))
+    x, rounds = solve_block_flow(matrix, force, inverse, tolerance=1e-2)
     T = nearby_rotation(product(lie.exp(x), s.T))
     cost = problem.cost(T)
     better = cost <= s.cost

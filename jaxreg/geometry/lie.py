@@ -79,6 +79,47 @@ def log(T: Motions) -> Float[Array, "*b k"]:
     return jnp.concatenate([t - turned / 2 + c * _cross(w, turned), w], axis=-1)
 
 
+def log_jacobian(tangent: Float[Array, "*b k"]) -> Float[Array, "*b k k"]:
+    """The derivative of `log(T exp(x))` at x = 0, from `tangent = log(T)`.
+
+    ad / (1 - exp(-ad)) with ad the adjoint of the tangent: an even polynomial of degree
+    4 beside ad / 2, as the eigenvalues of ad are 0 and, twice, i times the angle.
+    """
+    k = tangent.shape[-1]
+    d = 2 if k == 3 else 3
+    turn = _hat(tangent[..., d:])
+    if d == 2:
+        shift = jnp.stack([tangent[..., 1], -tangent[..., 0]], axis=-1)[..., None]
+    else:
+        shift = _hat(tangent[..., :d])
+    low = jnp.zeros((*tangent.shape[:-1], k - d, d), tangent.dtype)
+    corner = turn if d == 3 else jnp.zeros_like(low[..., :1])
+    top = jnp.concatenate([turn, shift], axis=-1)
+    ad = jnp.concatenate([top, jnp.concatenate([low, corner], axis=-1)], axis=-2)
+    sq = jnp.sum(tangent[..., d:] ** 2, axis=-1)[..., None, None]
+    wide = sq > _SMALL**2
+    safe = jnp.where(wide, sq, 1)
+    half = jnp.sqrt(safe) / 2
+    h = half / jnp.tan(half)
+    slope = h / 2 - (half / jnp.sin(half)) ** 2 / 2
+    a = jnp.where(wide, (slope - 2 * (h - 1)) / safe, 1 / 12 - sq**2 / 30240)
+    b = jnp.where(wide, (slope - h + 1) / safe**2, -1 / 720 - sq / 15120)
+    ad2 = jnp.einsum("...ab,...bc->...ac", ad, ad)
+    ad4 = jnp.einsum("...ab,...bc->...ac", ad2, ad2)
+    return jnp.eye(k, dtype=ad.dtype) + ad / 2 + a * ad2 + b * ad4
+
+
+def _hat(w: Float[Array, "*b r"]) -> Float[Array, "*b d d"]:
+    """The matrix of the cross product with a rotation vector."""
+    zero = jnp.zeros_like(w[..., 0])
+    if w.shape[-1] == 1:
+        rows = [[zero, -w[..., 0]], [w[..., 0], zero]]
+    else:
+        x, y, z = w[..., 0], w[..., 1], w[..., 2]
+        rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def _cross(w: Float[Array, "*b r"], v: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
     """The velocity of a point at v that turns with w."""
     if v.shape[-1] == 3:
