@@ -50,7 +50,7 @@ def aggregate(
     root = (label == frames) & reached
     # Aggregates beyond the room share that of others.
     parent = ((jnp.cumsum(root, dtype=jnp.int32) - 1) % count)[label]
-    return _between(parent, edges, strength > 0, count)
+    return _between(parent, edges, strength, count)
 
 
 def _paired(i: Array, j: Array, strength: Array, num: int) -> Int[Array, " v"]:
@@ -58,14 +58,10 @@ def _paired(i: Array, j: Array, strength: Array, num: int) -> Int[Array, " v"]:
 
     Both ends of an edge must hold it for their best: a few rounds pair nearly all.
     """
-    strength = jnp.where(i != j, strength, 0)
-    bucket, chance = _hashed(i, j, 2 * strength.shape[0])
-    # Parallel edges count together; the few others in the same bucket do no harm.
-    together = jnp.zeros((2 * strength.shape[0],), strength.dtype)
-    strength = jnp.where(strength > 0, together.at[bucket].add(strength)[bucket], 0)
+    strength, chance = _together(i, j, jnp.where(i != j, strength, 0))
     degree = jnp.zeros((num,), strength.dtype).at[i].add(strength).at[j].add(strength)
     both = jnp.where(strength > 0, degree[i] * degree[j], 1)
-    wish = strength * jax.lax.rsqrt(both) * (1 + 0.1 * chance.astype(strength.dtype))
+    wish = strength * jax.lax.rsqrt(both) * (1 + 0.1 * chance)
     frames = jnp.arange(num, dtype=jnp.int32)
 
     def best(at_i: Array, at_j: Array) -> Array:
@@ -90,11 +86,16 @@ def _paired(i: Array, j: Array, strength: Array, num: int) -> Int[Array, " v"]:
     return joined.at[joins_i].set(root[i], mode="drop")
 
 
-def _hashed(i: Array, j: Array, size: int) -> tuple[Array, Array]:
-    """A bucket of each unordered pair, and a number in [0, 1) to break ties."""
-    code = _code(i, j)
-    chance = (code >> 8).astype(jnp.float32) / 2**24
-    return (code % size).astype(jnp.int32), chance
+def _together(i: Array, j: Array, strength: Array) -> tuple[Array, Array]:
+    """The sum over parallel edges, and a number in [0, 1) to break ties.
+
+    The few other edges in the same bucket do no harm.
+    """
+    code, size = _code(i, j), 2 * strength.shape[0]
+    bucket = (code % size).astype(jnp.int32)
+    total = jnp.zeros((size,), strength.dtype).at[bucket].add(strength)[bucket]
+    chance = (code >> 8).astype(strength.dtype) / 2**24
+    return jnp.where(strength > 0, total, 0), chance
 
 
 def _code(i: Array, j: Array) -> Array:
@@ -106,15 +107,19 @@ def _code(i: Array, j: Array) -> Array:
     return x ^ (x >> 16)
 
 
-def _between(parent: Array, edges: Array, present: Array, count: int) -> Aggregates:
-    """Edges between aggregates, parallel ones merged."""
+def _between(parent: Array, edges: Array, strength: Array, count: int) -> Aggregates:
+    """Edges between aggregates, parallel ones merged; weak ones may find no room."""
     num_edges = edges.shape[0]
     room = max(1, min(-(-num_edges // _EDGES), count * (count - 1) // 2))
     low = jnp.min(parent[edges], axis=1)
     high = jnp.max(parent[edges], axis=1)
-    crossing = present & (low < high)
-    # By their codes, so that those that find no room are spread over the graph.
-    code = jnp.where(crossing, _code(low, high), jnp.uint32(0xFFFFFFFF))
+    crossing = (strength > 0) & (low < high)
+    # The strong first, by powers of eight, and those of a kind in no order, so that
+    # those that find no room are weak and spread over the graph.
+    total, _ = _together(low, high, jnp.where(crossing, strength, 0))
+    power = jnp.clip(-jnp.log2(jnp.where(crossing, total, 1)) / 3, 0, 7)
+    code = power.astype(jnp.uint32) << 29 | _code(low, high) >> 3
+    code = jnp.where(crossing, code, jnp.uint32(0xFFFFFFFF))
     order = jnp.arange(num_edges, dtype=jnp.int32)
     order = jax.lax.sort((code, order), num_keys=1)[1]
     low_, high_ = low[order], high[order]
