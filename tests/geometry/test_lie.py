@@ -93,3 +93,15 @@ def test_random_rotations_are_rotations_and_uniform(d):
     # Uniform over SO(d): every column has mean zero and covariance I / d.
     np.testing.assert_allclose(R.mean(0), 0, atol=0.05)
     np.testing.assert_allclose(np.cov(R[:, :, 0].T), np.eye(d) / d, atol=0.03)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("size", [1e-3, 0.5, 2.5])
+def test_log_jacobian_is_the_derivative_of_the_logarithm(d, size):
+    k = lie.tangent_dim(d)
+    with jax.enable_x64(True):
+        v = jnp.asarray(np.random.default_rng(d).normal(size=k))
+        v = v.at[d:].multiply(size / jnp.linalg.norm(v[d:]))
+        T = lie.exp(v)
+        expected = jax.jacfwd(lambda x: lie.log(T @ lie.exp(x)))(jnp.zeros(k))
+        np.testing.assert_allclose(lie.log_jacobian(v), expected, atol=1e-9)
