@@ -17,14 +17,13 @@ from jaxreg.averaging.base import (
 from jaxreg.averaging.cycles import edge_log_odds, judged
 from jaxreg.averaging.evidence import (
     agreement,
-    agrees,
     coherence,
     squared_errors,
-    votes,
 )
-from jaxreg.geometry import lie
+from jaxreg.averaging.laplacian import DENSE_LIMIT
+from jaxreg.averaging.moves import frames_moved, groups_moved, settled
 from jaxreg.graph import trees
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 
 
 _AGREES = 0.1
@@ -33,6 +32,8 @@ _AGREES = 0.1
 _FACTOR, _TERM, _TOWARD_BEST = 1.0, 2.0, 10.0
 # The search ends after so many rounds without a better hypothesis.
 _PATIENCE = 6
+# Hypotheses of a round that settle before they are compared with the best so far.
+_SETTLED = 8
 
 
 class CycleConsensus(AbstractAverager):
@@ -42,9 +43,10 @@ class CycleConsensus(AbstractAverager):
     each scale the tree of greatest odds. If the best contradicts believed edges, or
     some frame is reached by doubtful edges alone, further trees are drawn with randomly
     perturbed odds, round by round around the best so far, and the best is changed by
-    moving single frames to where most of their edges put them. All are compared by how
-    well frames agree with those next to them (`coherence`), over a ladder of scales:
-    no noise level is needed.
+    moving single frames, and groups beyond an edge of a tree, to where most of their
+    edges put them. All are compared by how well frames agree with those next to them
+    (`coherence`), over a ladder of scales: no noise level is needed. Up to
+    `DENSE_LIMIT` frames, the best of a round settle and are compared once more.
 
     Graphs too large for cycles get the better of the tree of greatest prior weight and
     the one of shortest paths, by the number of edges that agree.
@@ -77,9 +79,10 @@ class CycleConsensus(AbstractAverager):
         if not judged(graph):
             return solution(graph, _without_cycles(graph), num_steps=0)
         scale, odds = length_scale(graph), edge_log_odds(graph)
-        T = jax.vmap(lambda o: _tree(graph, o))(odds)
         # Prior weights and short chains are hypotheses of their own.
-        T = jnp.concatenate([T, jnp.stack([_heaviest(graph), _shortest(graph, odds)])])
+        weights = jnp.concatenate([odds, graph.weight[None]])
+        T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(weights)
+        T = jnp.concatenate([T, _shortest(graph, odds)[None]])
         score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
         best = jnp.argmax(score)
         own = odds[jnp.minimum(best, odds.shape[0] - 1)]
@@ -96,24 +99,36 @@ class CycleConsensus(AbstractAverager):
             return ~s.settled & (s.round < self.rounds) & (s.idle < _PATIENCE)
 
         def step(s: _Search) -> _Search:
-            return self._round(graph, odds, scale, s)
+            return self._round(graph, odds, scale, T, s)
 
         end = jax.lax.while_loop(unfinished, step, start)
         belief = jnp.where(graph.weight > 0, jax.nn.sigmoid(own), 0)
         return solution(graph, end.T, edge_weight=belief, num_steps=end.round)
 
     def _round(
-        self, graph: PoseGraph, odds: Array, scale: Array, s: "_Search"
+        self, graph: PoseGraph, odds: Array, scale: Array, starts: Array, s: "_Search"
     ) -> "_Search":
-        key, now = jax.random.split(s.key)
+        key, now, pick = jax.random.split(s.key, 3)
         shape = (2, self.hypotheses, graph.num_edges)
         noise = jax.random.logistic(now, shape, odds.dtype)
         each = odds[jnp.arange(self.hypotheses) % odds.shape[0]]
         each = jnp.exp(_FACTOR * noise[0]) * each + _TERM * noise[1]
         each = each + _TOWARD_BEST * _holds(graph, s.T, scale)
-        T = jax.vmap(lambda o: _tree(graph, o))(each)
-        T = jnp.concatenate([T, _moved(graph, s.T, scale, self.hypotheses)])
+        drawn = jax.vmap(lambda o: _forest(graph, o))(each)
+        across = groups_moved(
+            graph, s.T, scale, drawn.in_tree[0], odds[0], pick, self.hypotheses
+        )
+        single = frames_moved(graph, s.T, scale, self.hypotheses)
+        T = jnp.concatenate([starts, drawn.T_world_i, single, across])
         score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
+        if graph.num_poses <= DENSE_LIMIT:
+            # The starts settle in the first round, later the best.
+            start = (s.round == 0) & (jnp.arange(len(T)) < starts.shape[0])
+            chosen = jax.lax.top_k(jnp.where(start, jnp.inf, score), _SETTLED)[1]
+            fine = jax.vmap(lambda T: settled(graph, T, scale))(T[chosen])
+            finer = jax.vmap(lambda T: coherence(graph, T, scale))(fine)
+            finer = jnp.where(jnp.isfinite(finer), finer, -jnp.inf)
+            T, score = jnp.concatenate([T, fine]), jnp.concatenate([score, finer])
         best = jnp.argmax(score)
         better = score[best] > s.score
         return _Search(
@@ -135,49 +150,14 @@ class _Search(NamedTuple):
     key: Array
 
 
-def _tree(graph: PoseGraph, odds: Array) -> Array:
-    """Poses along the tree of greatest odds: no path has a safer weakest edge."""
+def _forest(graph: PoseGraph, odds: Array) -> trees.Forest:
+    """The tree of greatest odds: no path has a safer weakest edge."""
     present = graph.weight > 0
     low = jnp.min(jnp.where(present, odds, jnp.inf))
     weight = jnp.where(present, odds - low + 1, 0)
     return trees.maximum_spanning_tree(
         graph.edges, graph.T_i_j, weight, graph.num_poses
-    ).T_world_i
-
-
-def _moved(graph: PoseGraph, T: Array, scale: Array, most: int) -> Array:
-    """The poses with one frame moved to where most of its neighbours put it.
-
-    A copy for each of at most `most` frames: those that gain most agreement by it.
-    """
-    num, none = graph.num_poses, 2 * graph.num_edges
-    tail, head = jnp.concatenate([graph.edges, graph.edges[:, ::-1]]).T
-    T_tail_head = jnp.concatenate([graph.T_i_j, lie.inverse(graph.T_i_j)])
-    order = jnp.arange(none, dtype=jnp.int32)
-    vote = jnp.append(jnp.tile(votes(graph), 2), 0)
-    voters = jnp.full((num, num), none, jnp.int32)
-    voters = voters.at[head, tail].min(jnp.where(vote[:-1] > 0, order, none))
-    # Points whose squared distances are the errors between poses.
-    unit = jnp.sqrt(0.5) * jnp.ones_like(T[0, :-1]).at[:, -1].set(jnp.sqrt(2) / scale)
-    put = product(T[tail], T_tail_head)
-    here, there = ((unit * X[:, :-1]).reshape(X.shape[0], -1) for X in (T, put))
-    there = jnp.append(there, there[:1], axis=0)
-
-    def support(x: Array, v: Array) -> Array:
-        """The votes of the neighbours of frame v for placing it at x."""
-        parts = [(there[voters[v], c] - x[:, c, None]) ** 2 for c in range(x.shape[1])]
-        return jnp.sum(
-            vote[voters[v]] * agrees(sum(parts, jnp.zeros((), T.dtype))), axis=1
-        )
-
-    gain = support(there[:-1], head) - support(here, jnp.arange(num))[head]
-    gain = jnp.where((vote[:-1] > 0) & (head > 0), gain, -jnp.inf)
-    best = jnp.full((num,), -jnp.inf, T.dtype).at[head].max(gain)
-    first = jnp.where(gain == best[head], order, none - 1)
-    first = jnp.full((num,), none - 1, jnp.int32).at[head].min(first)
-    gained, frames = jax.lax.top_k(best, min(most, num))
-    moved = jax.vmap(lambda v: T.at[v].set(put[first[v]]))(frames)
-    return jnp.where((gained > 0)[:, None, None, None], moved, T)
+    )
 
 
 def _heaviest(graph: PoseGraph) -> Array:

@@ -8,6 +8,7 @@ Eq. 14 needs it, and "until change is negligible and k >= K" read as "or".
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -22,7 +23,7 @@ from jaxreg.averaging.base import (
     weighted_mean,
 )
 from jaxreg.averaging.consensus import CycleConsensus
-from jaxreg.averaging.evidence import redundancy
+from jaxreg.averaging.evidence import coherence, redundancy
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, gauss_newton_step
 from jaxreg.averaging.graduated import graduated
 from jaxreg.averaging.iterate import (
@@ -38,23 +39,30 @@ from jaxreg.averaging.tree import along_frames, start
 from jaxreg.graph.pose_graph import PoseGraph
 
 
+# Kernels of at most this width, radians and length scales, hold on to a start.
+_NARROW = 0.25
+
+
 class Correntropy(AbstractAverager):
     """Robust motion averaging: edges count by a Gaussian of their residual (Eq. 12).
 
     The default needs no start, no noise level and no tuning: a consensus of cycles as
-    the start, a kernel whose widths for rotation and translation shrink to three
-    standard deviations of the noise that the agreeing edges show, and, up to
-    `DENSE_LIMIT` frames, Gauss-Newton steps at the end in which each part counts at
-    its precision, or by `information` where the graph has it. `width="paper"` is the
-    published Algorithm 1. Larger graphs take `graduated` steps; where those leave many
-    edges out, the chain of successive frames is tried as a start, too.
+    the start, and a kernel whose widths for rotation and translation shrink to three
+    standard deviations of the noise that the agreeing edges show. Up to `DENSE_LIMIT`
+    frames the steps are those of Gauss-Newton, in which each part counts at its
+    precision, or by `information` where the graph has it; a wide kernel may draw a
+    start to a larger, less coherent group, so a narrow one is tried, too.
+    `width="paper"` is the published Algorithm 1. Larger graphs take `graduated` steps;
+    where those leave many edges out, the chain of successive frames is tried as a
+    start, too.
 
     Attributes:
         width: "annealed", or "paper" for sigma_k = alpha e_k with the mean residual
             e_k of Eq. 22 (static).
         alpha: kernel width over the mean residual, for "paper".
         rows: "sqrt" scales rows by the root of the weight, as half-quadratic theory
-            asks; "weight" by the weight itself, as printed in Eq. 17 (static).
+            asks; "weight" by the weight itself, as printed in Eq. 17 (static). For
+            "paper", and for the few plain steps that a start takes.
         max_steps: largest number of steps (static).
         tolerance: stop below this change, radians and share of the size of the scene.
         initialiser: finds the start when `init` is None.
@@ -91,7 +99,7 @@ class Correntropy(AbstractAverager):
         if self.width == "paper":
             end = self._paper(graph, T_start)
         elif graph.num_poses <= DENSE_LIMIT:
-            end = self._annealed(graph, T_start)
+            end = self._annealed(graph, T_start, init is None)
         else:
             end = self._graduated(graph, T_start, init is None)
         return solution(
@@ -126,32 +134,56 @@ class Correntropy(AbstractAverager):
         )
         return averaging_gradients(graph, end, gaussian_trust, rows)
 
-    def _annealed(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
-        rows = scaled_rows(self.rows)
-        T_start = _better_start(graph, T_start, rows)
-        end = iterate(
+    def _annealed(
+        self, graph: PoseGraph, T_start: Float[Array, "v D D"], compare: bool
+    ) -> Iterated:
+        """Ends from a wide kernel or, where more coherent, from a narrow one."""
+        fixed, T_start = jax.lax.stop_gradient((graph, T_start))
+        scale = length_scale(fixed)
+        T_wide = _better_start(fixed, T_start, scaled_rows(self.rows))
+        width = first_width(fixed, T_wide)
+        if not compare:
+            end = self._from_width(fixed, T_wide, width)
+            return gauss_newton_gradients(graph, end, gaussian_trust)
+        narrow = jnp.minimum(width, _NARROW * jnp.stack([scale, jnp.ones_like(scale)]))
+        doubt = (width[1] > _NARROW) | jnp.any(T_wide != T_start)
+
+        def unfinished(s: tuple[Array, Iterated, Array]) -> Array:
+            return s[0] < jnp.where(doubt, 2, 1)
+
+        def tried(s: tuple[Array, Iterated, Array]) -> tuple[Array, Iterated, Array]:
+            first = s[0] == 0
+            T = jnp.where(first, T_wide, T_start)
+            end = self._from_width(fixed, T, jnp.where(first, width, narrow))
+            score = coherence(fixed, end.T_world_i, scale)
+            best = jax.tree.map(
+                lambda new, old: jnp.where(score > s[2], new, old), end, s[1]
+            )
+            return s[0] + 1, best, jnp.maximum(score, s[2])
+
+        none = Iterated(
+            T_start,
+            jnp.zeros_like(graph.weight),
+            width,
+            jnp.asarray(False),
+            jnp.asarray(0, jnp.int32),
+        )
+        low = jnp.asarray(-jnp.inf, width.dtype)
+        start = (jnp.asarray(0, jnp.int32), none, low)
+        end = jax.lax.while_loop(unfinished, tried, start)[1]
+        return gauss_newton_gradients(graph, end, gaussian_trust)
+
+    def _from_width(self, graph: PoseGraph, T_start: Array, width: Array) -> Iterated:
+        return iterate(
             graph,
             T_start,
-            first_width(graph, T_start),
-            annealed_width,
-            gaussian_trust,
-            averaging_step(rows),
-            max_steps=self.max_steps,
-            # Gauss-Newton does the last digits better.
-            tolerance=1e-2,
-        )
-        last = iterate(
-            graph,
-            end.T_world_i,
-            end.width,
+            width,
             annealed_width,
             gaussian_trust,
             gauss_newton_step,
             max_steps=self.max_steps,
             tolerance=self.tolerance,
         )
-        last = last._replace(num_steps=end.num_steps + last.num_steps)
-        return gauss_newton_gradients(graph, last, gaussian_trust)
 
     def _graduated(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"], also_along_frames: bool

@@ -112,6 +112,6 @@ def coherence(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     own = own / jnp.maximum(jnp.mean(weight), jnp.finfo(sq.dtype).tiny)
     chance = jnp.sqrt(mean * (1 - mean) / (0.5 * _NEIGHBOURS * num))
     own = jnp.maximum(own - _CHANCE * chance, mean)
-    degree = 2 * jnp.sum(graph.weight > 0) / num
+    degree = 2 * jnp.sum((graph.weight > 0).astype(sq.dtype)) / num
     select = jnp.maximum(1 - 2 * _NEIGHBOURS / jnp.maximum(degree, 1), 0) ** 3
     return _NEAR * select * own + mean

@@ -1,7 +1,7 @@
 """Gauss-Newton steps on the weighted tangent errors, all k v unknowns together.
 
 Motion averaging solves for rotations and translations side by side, which is fast and
-nearly right; this finishes the job with each part at its own precision.
+nearly right; here each part counts at its own precision.
 """
 
 import jax

@@ -63,3 +63,37 @@ def random_graph(
         rotations(rng, num_edges, d, None), rng.uniform(-1, 1, (num_edges, d))
     )
     return X, edges, np.where(bad[:, None, None], wild, T), bad
+
+
+def folding_graph(
+    seed: int, num: int = 40
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Views around an object that looks alike from both sides, all pairs measured.
+
+    Right between near views; half of the motions between views on opposite sides agree
+    with each other on the poses that lay one side over the other; the rest is random.
+
+    Returns:
+        True poses, the folded ones, edges and motions.
+    """
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * np.arange(num) / num
+    turn = Rotation.from_rotvec(angle[:, None] * [0, 0, 1]).as_matrix()
+    X = motions(turn, np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1))
+    half_turn = np.diag([-1.0, -1, 1, 1])
+    folded = np.where(np.arange(num)[:, None, None] < num // 2, X, half_turn @ X)
+    edges = np.stack(np.triu_indices(num, 1), axis=1)
+    i, j = edges.T
+    apart = np.minimum(j - i, num - (j - i))
+    alike = (apart >= num // 2 - 9) & (rng.random(len(i)) < 0.5)
+    wild = motions(
+        rotations(rng, len(i), 3, None), rng.uniform(-1, 1, size=(len(i), 3))
+    )
+    flipped = np.linalg.inv(X[i]) @ half_turn @ X[j]
+    T = np.where(alike[:, None, None], flipped, wild)
+    T = np.where((apart <= 4)[:, None, None], np.linalg.inv(X[i]) @ X[j], T)
+    error = motions(
+        rotations(rng, len(i), 3, 0.01), 0.01 * rng.normal(size=(len(i), 3))
+    )
+    X, folded = np.linalg.inv(X[0]) @ X, np.linalg.inv(folded[0]) @ folded
+    return X, folded, edges, T @ error

@@ -284,6 +284,18 @@ def test_numbers_that_are_not_finite_cost_their_edge_alone():
     np.testing.assert_allclose(solution.T_world_i, X, atol=1e-5)
 
 
+def test_of_contradicting_measurements_of_a_pair_the_right_one_is_trusted():
+    X, edges, T, _ = random_graph(N, H, 0.0, 8)
+    wild = random_graph(N, H, 0.0, 9)[2]
+    again, twice = edges.copy(), T.copy()
+    again[-6:], twice[-6:] = edges[:6], wild[:6]
+    solution = average(single(X, again, twice), METHODS["annealed"])
+    assert errors(solution, X)[0] < np.deg2rad(0.5)
+    trust = np.asarray(solution.edge_weight)
+    assert trust[-6:].max() < 0.01
+    assert trust[:6].min() > 0.1
+
+
 def test_one_pose_no_edges_and_running_out_of_steps():
     empty = PoseGraph.from_edges([], np.zeros((0, 4, 4), np.float32), num_poses=1)
     for name in ("paths", "annealed"):

@@ -5,11 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.averaging import CycleConsensus, average
+from jaxreg.averaging.base import length_scale
 from jaxreg.averaging.cycles import NEUTRAL, edge_log_odds, judged
-from jaxreg.averaging.evidence import coherence
+from jaxreg.averaging.evidence import agreement, coherence
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_errors
-from tests.averaging.graphs import random_graph
+from tests.averaging.graphs import folding_graph, random_graph
 
 
 N, H = 16, 100
@@ -104,6 +105,20 @@ def test_coherence_against_a_loop_over_frames():
     )
     expected = 3 * select * own + mean
     np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
+def test_the_truth_is_more_coherent_than_a_larger_group_of_wrong_motions():
+    @jax.jit
+    def scores(graph, T):
+        scale = length_scale(graph)
+        return coherence(graph, T, scale), agreement(graph, T, scale)
+
+    for seed in range(3):
+        X, folded, edges, T = folding_graph(seed)
+        graph = single(X, edges, T)
+        true, wrong = (scores(graph, jnp.asarray(P, jnp.float32)) for P in (X, folded))
+        assert wrong[1] > 1.3 * true[1]
+        assert true[0] > 1.1 * wrong[0]
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.5])
