@@ -115,9 +115,8 @@ class CycleConsensus(AbstractAverager):
         each = jnp.exp(_FACTOR * noise[0]) * each + _TERM * noise[1]
         each = each + _TOWARD_BEST * _holds(graph, s.T, scale)
         drawn = jax.vmap(lambda o: _forest(graph, o))(each)
-        across = groups_moved(
-            graph, s.T, scale, drawn.in_tree[0], odds[0], pick, self.hypotheses
-        )
+        tree, most = drawn.in_tree[0], self.hypotheses
+        across = groups_moved(graph, s.T, scale, tree, odds[0], pick, most)
         single = frames_moved(graph, s.T, scale, self.hypotheses)
         T = jnp.concatenate([starts, drawn.T_world_i, single, across])
         score = jax.vmap(lambda T: coherence(graph, T, scale))(T)

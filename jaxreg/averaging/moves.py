@@ -56,8 +56,8 @@ def groups_moved(
 ) -> Float[Array, "m v D D"]:
     """The poses with the frames beyond one edge of a tree moved as a whole.
 
-    Of `_TRIED` motions across that do not agree with the poses, drawn by their belief
-    (log odds), the one that most others support. Frames whose motions agree with each
+    Of `_TRIED` motions across that do not agree with the poses, drawn by their log
+    odds, the one that most others support. Frames whose motions agree with each
     other form groups, and the motions between groups may agree on several places: this
     exchanges one for another.
     """
@@ -76,7 +76,7 @@ def groups_moved(
     vote, count = votes(graph), graph.num_edges
     new = agrees(squared_errors(graph, T, scale)) < 0.5
     noise = jax.random.gumbel(pick, (num, count), T.dtype)
-    likely = jax.nn.log_sigmoid(odds) + noise
+    likely = odds + noise
 
     def moved(inside: Array, likely: Array) -> Array:
         head, tail = inside[j], inside[i]
