@@ -24,10 +24,19 @@ _STRONG = 2.0
 
 
 class Placement(eqx.Module):
-    """Poses of the centred frames, and what they rest on."""
+    """Poses of the centred frames, and what they rest on.
+
+    Attributes:
+        T_world_i: `(v, d+1, d+1)`.
+        placed: `(v,)` the largest part.
+        part: `(v,)` int32, the same for scans that hang together.
+        edge_weight: `(e,)` trust in each pair.
+        status: of the averaging.
+    """
 
     T_world_i: Float[Array, "v D D"]
     placed: Bool[Array, " v"]
+    part: Int[Array, " v"]
     edge_weight: Float[Array, " e"]
     status: StatusArray
 
@@ -35,7 +44,6 @@ class Placement(eqx.Module):
 @eqx.filter_jit
 def place(
     motions: RelativeMotions,
-    pairs: Int[Array, "e 2"],
     num_scans: int,
     averaging: AbstractAverager | None,
     min_overlap: Scalar,
@@ -48,6 +56,7 @@ def place(
     """
     if averaging is None:
         averaging = Correntropy(width="paper", initialiser=SpanningTree())
+    pairs = motions.pairs
     trusted = jnp.where(motions.overlap >= min_overlap, motions.overlap, 0)
     label = components(pairs, trusted, num_scans)
     size = jnp.sum(label[:, None] == label[None, :], axis=1)
@@ -57,14 +66,21 @@ def place(
     graph = PoseGraph(swap[pairs], motions.T_i_j, trusted, trusted > 0, None, num_scans)
     solution = average(graph, averaging)
     edge_weight = solution.edge_weight * (trusted > 0)
-    agreed = jnp.where(edge_weight > _MIN_TRUST, trusted, 0)
+    agreed = jnp.where(believed(edge_weight), trusted, 0)
     label = _confirmed_components(pairs, agreed, num_scans, _STRONG * min_overlap)
     # Averaging made the largest set of candidates the world; the largest confirmed
     # part of it is what is placed.
     size = jnp.sum(label[:, None] == label[None, :], axis=1)
     size = jnp.where(solution.placed[swap], size, 0)
     placed = label == label[jnp.argmax(size)]
-    return Placement(solution.T_world_i[swap], placed, edge_weight, solution.status)
+    return Placement(
+        solution.T_world_i[swap], placed, label, edge_weight, solution.status
+    )
+
+
+def believed(edge_weight: Float[Array, " e"]) -> Bool[Array, " e"]:
+    """Which pairs join scans, by the trust that averaging leaves them."""
+    return edge_weight > _MIN_TRUST
 
 
 def _confirmed_components(

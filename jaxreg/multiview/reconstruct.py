@@ -2,18 +2,17 @@
 
     scans -> pairs -> particle filter -> motion averaging -> joint refinement
 
-Every stage is one compiled function. Under `jit` the stages run as one program; called
-with arrays, a thin loop around them divides the pairs into batches, runs two at a
-time, and reports progress.
+Every stage is one compiled function. Under `jit` the stages run as one program, with
+all pairs; called with arrays, a thin loop chooses the pairs round by round, runs two
+batches of them at a time, and reports progress.
 """
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array
 
 from jaxreg._core.checks import (
     as_float_array,
@@ -23,65 +22,15 @@ from jaxreg._core.checks import (
     is_concrete,
 )
 from jaxreg._core.padding import rounded_up, stacked
-from jaxreg._core.status import Status
-from jaxreg._core.threads import map_in_threads
-from jaxreg._core.typing import Key, Progress, StatusArray
+from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
-from jaxreg.geometry import lie
-from jaxreg.graph import PoseGraph
-from jaxreg.multiview.place import Placement, place
-from jaxreg.multiview.refine import refine_jointly
-from jaxreg.multiview.relative import RelativeMotions, all_pairs, relative_motions
+from jaxreg.multiview.finish import finish
+from jaxreg.multiview.plan import Order, all_pairs, first_pairs
+from jaxreg.multiview.relative import RelativeMotions, relative_motions
+from jaxreg.multiview.rounds import OnPairs, Rounds
 from jaxreg.multiview.scans import PreparedScans, prepare_scans
+from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.particle import ParticleFilter
-
-
-_PAIRS_PER_BATCH = 4
-_THREADS = 2
-
-
-class ReconstructionSolution(eqx.Module):
-    """One pose per scan, and every pair that was tried.
-
-    Attributes:
-        T_world_i: `(v, d+1, d+1)` maps scan i to the world, which is the frame of scan
-            0, or of the first placed scan if scan 0 could not be placed. Identity for
-            scans that are not placed.
-        status: int32; CONVERGED if every scan is placed, else DISCONNECTED.
-        scan_status: `(v,)` int32; CONVERGED, TOO_FEW_POINTS, or LOW_OVERLAP for scans
-            that could not be placed.
-        placed: `(v,)`.
-        graph: every pair that was registered, `T_i_j` in the input's frames and unit,
-            prior weight the overlap where it is trusted and else 0.
-        overlap: `(e,)` lesser share of either scan that lies on the other.
-        edge_weight: `(e,)` trust, 0 to 1: how well the pair's own motion agrees with
-            the final poses, by a Gaussian of the displacement of the scan whose width
-            is the sample spacing; 0 where the overlap is too small or a scan is not
-            placed.
-        inlier_rmse: `(e,)` distance of that share, in the unit of the input.
-        num_dropped: `(v,)` rows that were not finite.
-    """
-
-    T_world_i: Float[Array, "v D D"]
-    status: StatusArray
-    scan_status: Int[Array, " v"]
-    placed: Bool[Array, " v"]
-    graph: PoseGraph
-    overlap: Float[Array, " e"]
-    edge_weight: Float[Array, " e"]
-    inlier_rmse: Float[Array, " e"]
-    num_dropped: Int[Array, " v"]
-
-    def __repr__(self) -> str:
-        """One line: status, scans placed, pairs trusted."""
-        if not is_concrete(self.status) or self.status.ndim:
-            return f"ReconstructionSolution(T_world_i {self.T_world_i.shape})"
-        return (
-            f"ReconstructionSolution({Status(int(self.status)).name}, "
-            f"{int(jnp.sum(self.placed))} of {self.placed.size} scans placed, "
-            f"{int(jnp.sum(self.edge_weight > 0.5))} of {self.overlap.size} pairs "
-            "trusted)"
-        )
 
 
 def reconstruct(
@@ -91,9 +40,16 @@ def reconstruct(
     method: ParticleFilter | None = None,
     averaging: AbstractAverager | None = None,
     mask: object = None,
+    order: Order = "any",
+    previous: ReconstructionSolution | RelativeMotions | None = None,
     progress: Progress | None = None,
+    on_pairs: OnPairs | None = None,
 ) -> ReconstructionSolution:
     """Brings scans into one frame, without an initial guess.
+
+    All pairs of up to 20 scans are registered, of more at most ten pairs a scan: first
+    each with a few others, then those that join parts, close loops, or hold scans that
+    hang by a thread.
 
     Args:
         scans: a list of `(n_i, d)` point sets, or a padded array `(v, n, d)`.
@@ -102,7 +58,14 @@ def reconstruct(
         averaging: how relative motions become poses; None for the MCC paper's
             `Correntropy` from the spanning tree of largest overlap.
         mask: `(v, n)` True for valid points, for a padded array only.
+        order: "sequential" if each scan overlaps the next: only neighbours are
+            registered to begin with, of any number of scans; not under `jit`.
+        previous: a solution for the first of these scans, whose pairs are not
+            registered again; or the motions that `on_pairs` got in a run that was
+            interrupted, which leads to the same answer. Not under `jit`.
         progress: called as `progress(stage, done, total)`; not under `jit`.
+        on_pairs: called with the `RelativeMotions` of every few pairs as they are
+            found, in the input's frames and unit; not under `jit`.
 
     Returns:
         A `ReconstructionSolution`.
@@ -126,22 +89,64 @@ def reconstruct(
             f"method: wanted a ParticleFilter, found {type(method).__name__}."
         )
     key = check_key(key)
-    pairs = all_pairs(points.shape[0])
+    if order not in ("any", "sequential"):
+        raise ValueError(f"order: wanted 'any' or 'sequential', found {order!r}.")
     if not (is_concrete(points) and is_concrete(key)):
+        if order != "any" or not (previous is None and on_pairs is None):
+            raise ValueError(
+                "order, previous, on_pairs: pairs are chosen outside of jit only."
+            )
         prepared = prepare_scans(method, points, row_mask)
+        pairs = jnp.asarray(all_pairs(points.shape[0]))
         motions = relative_motions(method, prepared, pairs, key)
-        return _finish(method, averaging, prepared, pairs, motions)
+        return finish(method, averaging, prepared, motions)
 
     report = progress if progress is not None else _silent
     report("preparing scans", 0, 1)
     prepared = jax.block_until_ready(prepare_scans(method, points, row_mask))
     report("preparing scans", 1, 1)
-    motions = _motions_in_batches(method, prepared, pairs, key, report)
+    known, first = _known(previous, prepared, order)
+    rounds = Rounds(method, averaging, prepared, key, known, on_pairs, report)
+    motions = rounds.run(order, first)
     report("averaging and refining", 0, 1)
-    solution = _finish(method, averaging, prepared, pairs, motions)
+    solution = finish(method, averaging, prepared, motions.padded(rounds.most))
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
-    return solution
+    return solution.of_pairs(len(motions.overlap))
+
+
+def _known(
+    previous: ReconstructionSolution | RelativeMotions | None,
+    scans: PreparedScans,
+    order: Order,
+) -> tuple[RelativeMotions | None, np.ndarray | None]:
+    """Motions in the centred frames, and the pairs to begin with, None for the usual.
+
+    Those of an earlier solution and those that join new scans to each other and to it.
+    """
+    if previous is None:
+        return None, None
+    earlier = isinstance(previous, ReconstructionSolution)
+    motions = previous.motions if earlier else previous
+    if not isinstance(motions, RelativeMotions):
+        raise TypeError(
+            "previous: wanted a ReconstructionSolution or RelativeMotions, found "
+            f"{type(previous).__name__}."
+        )
+    if motions.T_i_j.shape[-1] != scans.mean.shape[-1] + 1:
+        raise ValueError("previous: of another dimension than the scans.")
+    num_old = previous.num_scans if earlier else 1 + int(np.max(motions.pairs))
+    if num_old > scans.num_scans:
+        raise ValueError(
+            f"previous: of {num_old} scans, but there are {scans.num_scans}."
+        )
+    first = None
+    if earlier:
+        rng = np.random.default_rng(num_old)
+        new = first_pairs(scans.num_scans, order, rng)
+        first = np.concatenate([motions.pairs, new[new[:, 1] >= num_old]])
+        first = np.unique(first, axis=0)
+    return motions.in_centred_frames(scans), first
 
 
 def _silent(stage: str, done: int, total: int) -> None:
@@ -176,104 +181,3 @@ def _padded(scans: object, mask: object) -> tuple[Array, Array]:
             f"(v, n, d), found shape {points.shape}."
         )
     return points, check_mask(mask, points.shape[:2], "mask")
-
-
-def _motions_in_batches(
-    method: ParticleFilter,
-    prepared: PreparedScans,
-    pairs: Int[Array, "e 2"],
-    key: Key,
-    report: Progress,
-) -> RelativeMotions:
-    """The pairs in batches of one compiled size, two batches at a time."""
-    total = pairs.shape[0]
-
-    def run(start: int) -> RelativeMotions:
-        rows = np.minimum(np.arange(start, start + _PAIRS_PER_BATCH), total - 1)
-        return jax.block_until_ready(
-            relative_motions(method, prepared, pairs[rows], key)
-        )
-
-    starts = range(0, total, _PAIRS_PER_BATCH)
-    report("registering pairs", 0, total)
-    batches = []
-    for batch in map_in_threads(run, starts, _THREADS):
-        batches.append(batch)
-        done = min(len(batches) * _PAIRS_PER_BATCH, total)
-        report("registering pairs", done, total)
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[:total], *batches)
-
-
-@eqx.filter_jit
-def _finish(
-    method: ParticleFilter,
-    averaging: AbstractAverager | None,
-    scans: PreparedScans,
-    pairs: Int[Array, "e 2"],
-    motions: RelativeMotions,
-) -> ReconstructionSolution:
-    """Averages, refines, and returns to the frames and unit of the input."""
-    min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
-    placement = place(motions, pairs, scans.num_scans, averaging, min_overlap)
-    T_centred = refine_jointly(
-        scans, placement.T_world_i, placement.placed, min_overlap / 2
-    )
-    i, j = pairs[:, 0], pairs[:, 1]
-    weight = jnp.where(motions.overlap >= min_overlap, motions.overlap, 0)
-    graph = PoseGraph(
-        pairs,
-        scans.to_input_frames(motions.T_i_j, i, j),
-        weight,
-        jnp.ones(pairs.shape[0], bool),
-        None,
-        scans.num_scans,
-    )
-    placed = placement.placed
-    scan_status = jnp.where(placed, Status.CONVERGED, Status.LOW_OVERLAP)
-    scan_status = jnp.where(scans.enough, scan_status, Status.TOO_FEW_POINTS)
-    return ReconstructionSolution(
-        T_world_i=_in_first_frame(scans, T_centred, placement),
-        status=jnp.where(jnp.all(placed), Status.CONVERGED, Status.DISCONNECTED).astype(
-            jnp.int32
-        ),
-        scan_status=scan_status.astype(jnp.int32),
-        placed=placed,
-        graph=graph,
-        overlap=motions.overlap,
-        edge_weight=_trust(scans, pairs, motions, T_centred, placed, weight),
-        inlier_rmse=motions.inlier_rmse * scans.radius,
-        num_dropped=scans.num_dropped,
-    )
-
-
-def _trust(
-    scans: PreparedScans,
-    pairs: Int[Array, "e 2"],
-    motions: RelativeMotions,
-    T_world_i: Float[Array, "v D D"],
-    placed: Bool[Array, " v"],
-    weight: Float[Array, " e"],
-) -> Float[Array, " e"]:
-    """Agreement of the pairs' motions with the poses; the centred radius is one."""
-    i, j = pairs[:, 0], pairs[:, 1]
-    T_error = lie.inverse(T_world_i[i]) @ T_world_i[j] @ lie.inverse(motions.T_i_j)
-    turn = lie.rotation_angle(lie.rotation(T_error))
-    centre = lie.translation(lie.inverse(T_world_i[i]) @ T_world_i[j])
-    shift = centre - lie.translation(motions.T_i_j)
-    sq = turn**2 + jnp.sum(shift**2, axis=-1)
-    spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
-    trust = jnp.exp(-sq / (2 * jnp.maximum(spacing, 1e-6) ** 2))
-    return jnp.where((weight > 0) & placed[i] & placed[j], trust, 0)
-
-
-def _in_first_frame(
-    scans: PreparedScans, T_centred: Array, placement: Placement
-) -> Float[Array, "v D D"]:
-    """Poses relative to the first placed scan, in the input's frames and unit."""
-    first = jnp.argmax(placement.placed).astype(jnp.int32)
-    ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
-    T_first_i = lie.inverse(T_centred[first]) @ T_centred
-    T = scans.to_input_frames(T_first_i, jnp.full_like(ids, first), ids)
-    eye = jnp.eye(T.shape[-1], dtype=T.dtype)
-    keep = placement.placed & (ids != first)
-    return jnp.where(keep[:, None, None], T, eye)

@@ -12,25 +12,52 @@ from jaxreg.particle import ParticleFilter
 
 
 class RelativeMotions(eqx.Module):
-    """What the search found for each pair, in the scans' centred frames.
+    """What the search found for pairs of scans, scan j on scan i.
 
     Attributes:
+        pairs: `(e, 2)` int32, the scans i < j.
         T_i_j: `(e, d+1, d+1)`.
-        overlap: `(e,)` see `RegistrationSolution`.
-        inlier_rmse: `(e,)` in units of the common radius.
-        status: `(e,)` int32.
+        overlap: `(e,)` see `RegistrationSolution`; 0 where no pose was found.
+        inlier_rmse: `(e,)` in the unit of the motions.
     """
 
+    pairs: Int[Array, "*e 2"]
     T_i_j: Float[Array, "*e D D"]
     overlap: Float[Array, "*e"]
     inlier_rmse: Float[Array, "*e"]
-    status: Int[Array, "*e"]
 
+    def rows(self, rows: Int[Array, " r"]) -> "RelativeMotions":
+        """Some of them."""
+        return jax.tree.map(lambda x: x[rows], self)
 
-def all_pairs(num_scans: int) -> Int[Array, "e 2"]:
-    """Every pair i < j once."""
-    i, j = jnp.triu_indices(num_scans, 1)
-    return jnp.stack([i, j], axis=1).astype(jnp.int32)
+    def padded(self, num: int) -> "RelativeMotions":
+        """With pairs of scan 0 and itself that do not overlap, to so many."""
+        more = num - len(self.overlap)
+
+        def pad(x: Array) -> Array:
+            return jnp.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1))
+
+        return jax.tree.map(pad, self)
+
+    @staticmethod
+    def joined(some: list["RelativeMotions"]) -> "RelativeMotions":
+        """All of them, in ascending order of the scans."""
+        every = jax.tree.map(lambda *x: jnp.concatenate(x), *some)
+        return every.rows(jnp.lexsort((every.pairs[:, 1], every.pairs[:, 0])))
+
+    def in_input_frames(self, scans: PreparedScans) -> "RelativeMotions":
+        """From the scans' centred frames and unit."""
+        i, j = self.pairs[:, 0], self.pairs[:, 1]
+        T_i_j = scans.to_input_frames(self.T_i_j, i, j)
+        rmse = scans.radius * self.inlier_rmse
+        return RelativeMotions(self.pairs, T_i_j, self.overlap, rmse)
+
+    def in_centred_frames(self, scans: PreparedScans) -> "RelativeMotions":
+        """The other way."""
+        i, j = self.pairs[:, 0], self.pairs[:, 1]
+        T_i_j = scans.to_centred_frames(self.T_i_j, i, j)
+        rmse = self.inlier_rmse / scans.radius
+        return RelativeMotions(self.pairs, T_i_j, self.overlap, rmse)
 
 
 @eqx.filter_jit
@@ -42,27 +69,27 @@ def relative_motions(
 ) -> RelativeMotions:
     """Registers scan j to scan i for each pair (i, j), one pair after another.
 
-    The random numbers of a pair depend on its ids alone, not on its place in the
-    batch, so any division of the pairs into batches gives the same answer.
+    In the scans' centred frames. The random numbers of a pair depend on its ids alone,
+    not on the number of scans nor on its place in the batch, so any division of the
+    pairs into batches gives the same answer.
     """
 
     def one(pair: Array) -> RelativeMotions:
         i, j = pair
-        pair_key = jax.random.fold_in(key, i * scans.num_scans + j)
         solution = method.solve_indexed(
             scans.cloud(j),
             scans.cloud(i),
             scans.table(j),
             scans.table(i),
             None,
-            pair_key,
+            jax.random.fold_in(jax.random.fold_in(key, i), j),
         )
         usable = scans.enough[i] & scans.enough[j]
         return RelativeMotions(
+            pair,
             solution.T_target_source,
             jnp.where(usable, solution.overlap, 0),
             solution.inlier_rmse,
-            solution.status,
         )
 
     return lax.map(one, pairs)

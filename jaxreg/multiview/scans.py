@@ -55,6 +55,15 @@ class PreparedScans(eqx.Module):
         t = self.radius * lie.translation(T_i_j) + self.mean[i]
         return lie.compose(R, t - jnp.einsum("...ij,...j->...i", R, self.mean[j]))
 
+    def to_centred_frames(
+        self, T_i_j: Motions, i: Int[Array, "*b"], j: Int[Array, "*b"]
+    ) -> Motions:
+        """The other way."""
+        R = lie.rotation(T_i_j)
+        moved = jnp.einsum("...ij,...j->...i", R, self.mean[j])
+        t = lie.translation(T_i_j) + moved - self.mean[i]
+        return lie.compose(R, t / self.radius)
+
 
 def clean(
     points: Float[Array, "v n d"], mask: Bool[Array, "v n"]

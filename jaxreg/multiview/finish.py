@@ -1,0 +1,90 @@
+"""From the motions of pairs to the answer: poses, statuses, trust."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core.status import Status
+from jaxreg.averaging import AbstractAverager
+from jaxreg.geometry import lie
+from jaxreg.graph import PoseGraph
+from jaxreg.multiview.place import Placement, place
+from jaxreg.multiview.refine import refine_jointly
+from jaxreg.multiview.relative import RelativeMotions
+from jaxreg.multiview.scans import PreparedScans
+from jaxreg.multiview.solution import ReconstructionSolution
+from jaxreg.particle import ParticleFilter
+
+
+@eqx.filter_jit
+def finish(
+    method: ParticleFilter,
+    averaging: AbstractAverager | None,
+    scans: PreparedScans,
+    motions: RelativeMotions,
+) -> ReconstructionSolution:
+    """Averages, refines, and returns to the frames and unit of the input.
+
+    Args:
+        method: its `min_overlap` tells which pairs are believed.
+        averaging: see `place`.
+        scans: prepared scans.
+        motions: of pairs, in the scans' centred frames; some may be padding.
+    """
+    min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
+    placement = place(motions, scans.num_scans, averaging, min_overlap)
+    T_centred = refine_jointly(
+        scans, placement.T_world_i, placement.placed, min_overlap / 2
+    )
+    weight = jnp.where(motions.overlap >= min_overlap, motions.overlap, 0)
+    found = motions.in_input_frames(scans)
+    real = motions.pairs[:, 0] != motions.pairs[:, 1]
+    graph = PoseGraph(found.pairs, found.T_i_j, weight, real, None, scans.num_scans)
+    placed = placement.placed
+    scan_status = jnp.where(placed, Status.CONVERGED, Status.LOW_OVERLAP)
+    scan_status = jnp.where(scans.enough, scan_status, Status.TOO_FEW_POINTS)
+    return ReconstructionSolution(
+        T_world_i=_in_first_frame(scans, T_centred, placement),
+        status=jnp.where(jnp.all(placed), Status.CONVERGED, Status.DISCONNECTED).astype(
+            jnp.int32
+        ),
+        scan_status=scan_status.astype(jnp.int32),
+        placed=placed,
+        graph=graph,
+        overlap=motions.overlap,
+        edge_weight=_trust(scans, motions, T_centred, placed, weight),
+        inlier_rmse=found.inlier_rmse,
+        num_dropped=scans.num_dropped,
+    )
+
+
+def _trust(
+    scans: PreparedScans,
+    motions: RelativeMotions,
+    T_world_i: Float[Array, "v D D"],
+    placed: Bool[Array, " v"],
+    weight: Float[Array, " e"],
+) -> Float[Array, " e"]:
+    """Agreement of the pairs' motions with the poses; the centred radius is one."""
+    i, j = motions.pairs[:, 0], motions.pairs[:, 1]
+    T_error = lie.inverse(T_world_i[i]) @ T_world_i[j] @ lie.inverse(motions.T_i_j)
+    turn = lie.rotation_angle(lie.rotation(T_error))
+    centre = lie.translation(lie.inverse(T_world_i[i]) @ T_world_i[j])
+    shift = centre - lie.translation(motions.T_i_j)
+    sq = turn**2 + jnp.sum(shift**2, axis=-1)
+    spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
+    trust = jnp.exp(-sq / (2 * jnp.maximum(spacing, 1e-6) ** 2))
+    return jnp.where((weight > 0) & placed[i] & placed[j], trust, 0)
+
+
+def _in_first_frame(
+    scans: PreparedScans, T_centred: Array, placement: Placement
+) -> Float[Array, "v D D"]:
+    """Poses relative to the first placed scan, in the input's frames and unit."""
+    first = jnp.argmax(placement.placed).astype(jnp.int32)
+    ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
+    T_first_i = lie.inverse(T_centred[first]) @ T_centred
+    T = scans.to_input_frames(T_first_i, jnp.full_like(ids, first), ids)
+    eye = jnp.eye(T.shape[-1], dtype=T.dtype)
+    keep = placement.placed & (ids != first)
+    return jnp.where(keep[:, None, None], T, eye)

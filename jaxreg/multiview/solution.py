@@ -1,0 +1,79 @@
+"""What `reconstruct` returns."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.checks import is_concrete
+from jaxreg._core.status import Status
+from jaxreg._core.typing import StatusArray
+from jaxreg.graph import PoseGraph
+from jaxreg.multiview.relative import RelativeMotions
+
+
+class ReconstructionSolution(eqx.Module):
+    """One pose per scan, and every pair that was tried.
+
+    Attributes:
+        T_world_i: `(v, d+1, d+1)` maps scan i to the world, which is the frame of scan
+            0, or of the first placed scan if scan 0 could not be placed. Identity for
+            scans that are not placed.
+        status: int32; CONVERGED if every scan is placed, else DISCONNECTED.
+        scan_status: `(v,)` int32; CONVERGED, TOO_FEW_POINTS, or LOW_OVERLAP for scans
+            that could not be placed.
+        placed: `(v,)`.
+        graph: every pair that was registered, `T_i_j` in the input's frames and unit,
+            prior weight the overlap where it is trusted and else 0.
+        overlap: `(e,)` see `RegistrationSolution`.
+        edge_weight: `(e,)` trust, 0 to 1: how well the pair's own motion agrees with
+            the final poses, by a Gaussian of the displacement of the scan whose width
+            is the sample spacing; 0 where the overlap is too small or a scan is not
+            placed.
+        inlier_rmse: `(e,)` distance of that share, in the unit of the input.
+        num_dropped: `(v,)` rows that were not finite.
+    """
+
+    T_world_i: Float[Array, "v D D"]
+    status: StatusArray
+    scan_status: Int[Array, " v"]
+    placed: Bool[Array, " v"]
+    graph: PoseGraph
+    overlap: Float[Array, " e"]
+    edge_weight: Float[Array, " e"]
+    inlier_rmse: Float[Array, " e"]
+    num_dropped: Int[Array, " v"]
+
+    @property
+    def motions(self) -> RelativeMotions:
+        """The pairs as they were registered, in the input's frames and unit."""
+        return RelativeMotions(
+            self.graph.edges, self.graph.T_i_j, self.overlap, self.inlier_rmse
+        )
+
+    @property
+    def num_scans(self) -> int:
+        """V."""
+        return self.placed.shape[0]
+
+    def of_pairs(self, num: int) -> "ReconstructionSolution":
+        """With the first so many pairs; the others were padding."""
+
+        def pairs_of(s: ReconstructionSolution) -> tuple[object, ...]:
+            g = s.graph
+            of_graph = g.edges, g.T_i_j, g.weight, g.mask
+            return *of_graph, s.overlap, s.edge_weight, s.inlier_rmse
+
+        parts = jax.tree.map(lambda x: x[:num], pairs_of(self))
+        return eqx.tree_at(pairs_of, self, parts)
+
+    def __repr__(self) -> str:
+        """One line: status, scans placed, pairs trusted."""
+        if not is_concrete(self.status) or self.status.ndim:
+            return f"ReconstructionSolution(T_world_i {self.T_world_i.shape})"
+        return (
+            f"ReconstructionSolution({Status(int(self.status)).name}, "
+            f"{int(jnp.sum(self.placed))} of {self.placed.size} scans placed, "
+            f"{int(jnp.sum(self.edge_weight > 0.5))} of {self.overlap.size} pairs "
+            "trusted)"
+        )
