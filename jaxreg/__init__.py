@@ -67,6 +67,7 @@ from jaxreg.local import PointToPoint as PointToPoint
 from jaxreg.local import RegistrationSolution as RegistrationSolution
 from jaxreg.local import Symmetric as Symmetric
 from jaxreg.multiview import ReconstructionSolution as ReconstructionSolution
+from jaxreg.multiview import RelativeMotions as RelativeMotions
 from jaxreg.multiview import reconstruct as reconstruct
 from jaxreg.neighbours import BoxTree as BoxTree
 from jaxreg.neighbours import BruteForce as BruteForce

@@ -36,8 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"jaxreg: {where}{err.strerror or err}; nothing was written.\n"
         )
         return 2
-    except KeyboardInterrupt:
-        sys.stderr.write("jaxreg: interrupted; no results were written.\n")
+    except KeyboardInterrupt as err:
+        kept = str(err) or "no results were written"
+        sys.stderr.write(f"jaxreg: interrupted; {kept}.\n")
         return 130
 
 

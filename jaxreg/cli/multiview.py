@@ -1,8 +1,9 @@
 """`jaxreg multiview`: many scans into one frame."""
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -14,7 +15,8 @@ from jaxreg.cli.inputs import Scans, load_scans
 from jaxreg.cli.runtime import Options, Session
 from jaxreg.io.atomic import require_writable
 from jaxreg.io.errors import InputError
-from jaxreg.io.result import Result
+from jaxreg.io.pair_log import PairLog, Pairs
+from jaxreg.io.result import Result, version
 from jaxreg.io.stanford import read_conf
 
 
@@ -38,6 +40,10 @@ class Multiview(Options):
     """Two or more files (PLY, XYZ, CSV, TXT, NPY), a folder, or an NPZ of scans."""
     truth: Path | None = None
     """Pose file of the Stanford repository (.conf, metres): adds a table of errors."""
+    order: Literal["any", "sequential"] = "any"
+    """Of the scans; sequential if each overlaps the next: fewer pairs are tried."""
+    resume: bool = False
+    """Go on with the pairs that an interrupted run left in the output folder."""
 
     def run(self, session: Session) -> int:
         """Runs the command; returns the exit code."""
@@ -49,21 +55,58 @@ class Multiview(Options):
             scans = load_scans(self.scans)
             truth = None if self.truth is None else _read_truth(self.truth, scans)
         require_writable(self.out)
-        key = self.key()
-        with session.progress() as progress, session.timed("run", computes=True):
-            result = reconstruct_scans(scans, key, progress)
+        key, log = self.key(), self._log(scans)
+        try:
+            with session.progress() as progress, session.timed("run", computes=True):
+                result = reconstruct_scans(scans, key, progress, self.order, log)
+        except KeyboardInterrupt as err:
+            if not len(log):
+                raise
+            raise KeyboardInterrupt(
+                f"{len(log)} pairs are kept in {log.path}; "
+                "the same command with --resume goes on from there"
+            ) from err
         require_two_placed(result, scans)
         errors = None if truth is None else outputs.pose_errors(result, *truth)
         report(session, result, scans, errors)
+        log.remove()
         return 0
 
+    def _log(self, scans: Scans) -> PairLog:
+        digest = hashlib.sha256(repr(scans.names).encode())
+        for points in scans.points:
+            digest.update(np.ascontiguousarray(points).tobytes())
+        run = {
+            "scans": digest.hexdigest(),
+            "seed": self.seed,
+            "version": version("jaxreg"),
+        }
+        return PairLog(self.out / "pairs.jsonl", run, resume=self.resume)
 
-def reconstruct_scans(scans: Scans, key: Any, progress: Progress) -> Result:
-    """Reconstructs centred scans and moves the answer to the frames of the files."""
+
+def reconstruct_scans(
+    scans: Scans,
+    key: Any,
+    progress: Progress,
+    order: Literal["any", "sequential"] = "any",
+    log: PairLog | None = None,
+) -> Result:
+    """Reconstructs centred scans and moves the answer to the frames of the files.
+
+    Pairs that `log` holds are not registered again, and those found are added to it.
+    """
     import jaxreg
 
     centred, middles = scans.centred()
-    sol = jaxreg.reconstruct(centred, key=key, progress=progress)
+    kept = None if log is None or log.pairs is None else log.pairs
+    sol = jaxreg.reconstruct(
+        centred,
+        key=key,
+        order=order,
+        previous=None if kept is None else jaxreg.RelativeMotions(*map(_array, kept)),
+        progress=progress,
+        on_pairs=None if log is None else lambda m: log.add(_pairs(m)),
+    )
     placed, keep = np.asarray(sol.placed), np.asarray(sol.graph.mask)
     world = middles[np.argmax(placed)]  # the frame of the first placed scan
     edges = np.asarray(sol.graph.edges)[keep]
@@ -83,6 +126,22 @@ def reconstruct_scans(scans: Scans, key: Any, progress: Progress) -> Result:
         overlap=np.asarray(sol.overlap)[keep],
         weight=np.asarray(sol.edge_weight)[keep],
         inlier_rmse=np.asarray(sol.inlier_rmse)[keep],
+    )
+
+
+def _array(x: np.ndarray) -> Any:
+    """On the device, floats as the centred scans have them."""
+    import jax.numpy as jnp
+
+    return jnp.asarray(x, jnp.float32 if x.dtype.kind == "f" else x.dtype)
+
+
+def _pairs(motions: Any) -> Pairs:
+    return Pairs(
+        *map(
+            np.asarray,
+            (motions.pairs, motions.T_i_j, motions.overlap, motions.inlier_rmse),
+        )
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -49,8 +50,10 @@ def _fake_reconstruct(
     """A solver that knows the poses of the centred scans; returns what it was given."""
     given: list[Any] = []
 
-    def reconstruct(scans: list[np.ndarray], *, key: Any, progress: Any) -> Any:
-        given.append((scans, key))
+    def reconstruct(
+        scans: list[np.ndarray], *, key: Any, progress: Any, **options: Any
+    ) -> Any:
+        given.append((scans, key, options))
         progress("pairs", 1, 3)
         progress("pairs", 3, 3)
         v = len(scans)
@@ -363,6 +366,39 @@ def test_interruption_is_said_in_one_line(
     monkeypatch.setattr(jaxreg, "reconstruct", stopped)
     assert main(["multiview", *scans]) == 130
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)
+    found = jaxreg.RelativeMotions(
+        jnp.array([[0, 1]]), jnp.eye(4)[None], jnp.array([0.7]), jnp.array([0.01])
+    )
+
+    def stopped(*_: Any, on_pairs: Any, **__: Any) -> None:
+        on_pairs(found)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jaxreg, "reconstruct", stopped)
+    assert main(["multiview", *scans]) == 130
+    message = capsys.readouterr().err
+    assert "1 pairs are kept" in message
+    assert "--resume" in message
+    kept = folder / "jaxreg-out" / "pairs.jsonl"
+    assert kept.exists()
+    # Pairs of another run are not taken for those of this one, nor lost.
+    assert main(["multiview", *scans, "--resume", "--seed", "1"]) == 2
+    assert "another seed" in capsys.readouterr().err
+    given = _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans, "--resume", "--order", "sequential"]) == 0
+    options = given[0][2]
+    assert options["order"] == "sequential"
+    for one, other in zip(
+        jax.tree.leaves(options["previous"]), jax.tree.leaves(found), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    assert not kept.exists()
 
 
 def test_a_missing_extra_is_said_in_two_lines(
