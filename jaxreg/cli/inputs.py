@@ -10,6 +10,10 @@ from jaxreg.io.errors import InputError
 from jaxreg.io.points import read_scans, unique_names
 
 
+# Scans whose extents differ by such a factor are taken to be in different units.
+_OTHER_UNIT = 50.0
+
+
 @dataclass(frozen=True)
 class Scans:
     """Scans as they were read, and where each came from.
@@ -46,7 +50,8 @@ def load_scans(paths: Sequence[Path]) -> Scans:
 
     Raises:
         InputError: if a file cannot be read, there are fewer than two scans, 2D and 3D
-            are mixed, or a scan has fewer than d + 1 distinct finite points.
+            are mixed, a scan is far larger or smaller than the others, or has fewer
+            than d + 1 distinct finite points.
     """
     names: list[str] = []
     points: list[np.ndarray] = []
@@ -60,6 +65,7 @@ def load_scans(paths: Sequence[Path]) -> Scans:
     scans = Scans(unique_names(names), points, places)
     _require_two(scans)
     _require_one_dimension(scans)
+    _require_one_unit(scans)
     for place, array in zip(scans.places, scans.points, strict=True):
         _require_points(place, array)
     return scans
@@ -81,6 +87,23 @@ def _require_one_dimension(scans: Scans) -> None:
                 f"{place}: is {array.shape[1]}D, but {scans.places[0]} is {first}D.\n"
                 "Register 2D scans and 3D scans apart."
             )
+
+
+def _require_one_unit(scans: Scans) -> None:
+    extents = np.array([_extent(x) for x in scans.points])
+    usual = np.median(extents)
+    for place, extent in zip(scans.places, extents, strict=True):
+        ratio = extent / usual if usual > 0 else 1.0
+        if ratio > _OTHER_UNIT or 0 < ratio < 1 / _OTHER_UNIT:
+            raise InputError(
+                f"{place}: spans {extent:.4g}, the others about {usual:.4g}: is it in "
+                "another unit?\nScale it to the unit of the others, or leave it out."
+            )
+
+
+def _extent(points: np.ndarray) -> float:
+    finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+    return float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 0.0
 
 
 def _require_points(place: str, array: np.ndarray) -> None:

@@ -295,6 +295,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
     np.save(folder / "few.npy", np.repeat(CLOUD[:3], 9, axis=0))
     np.save(folder / "nan.npy", np.where(np.arange(40)[:, None] < 3, CLOUD, np.nan))
     np.save(folder / "flat.npy", CLOUD[:, :2])
+    np.save(folder / "mm.npy", 1000 * CLOUD)
     np.savez(folder / "one.npz", alone=CLOUD)
     np.savez(folder / "three.npz", a=CLOUD, b=CLOUD, c=CLOUD)
     (folder / "hollow").mkdir()
@@ -309,6 +310,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "too few": ([m, "s0.npy", "few.npy"], "few.npy: holds 3 distinct"),
         "all but three NaN": ([m, "s0.npy", "nan.npy"], "nan.npy: holds 3 distinct"),
         "mixed": ([m, "s0.npy", "flat.npy"], "flat.npy: is 2D, but s0.npy is 3D"),
+        "other unit": ([m, *pair, "mm.npy"], "mm.npy: spans"),
         "one file": ([m, "s0.npy"], "s0.npy: this is one scan alone"),
         "one in archive": ([m, "one.npz"], "one.npz: this is one scan alone"),
         "no scan": ([m], "No scans given"),
@@ -326,7 +328,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
     }
 
 
-@pytest.mark.parametrize("kind", range(20))
+@pytest.mark.parametrize("kind", range(21))
 def test_bad_input_is_named_in_two_lines_with_exit_code_2(
     folder: Path, capsys: pytest.CaptureFixture[str], kind: int
 ):

@@ -1,5 +1,6 @@
 """`reconstruct` on scans of a generated sculpture."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,9 +10,14 @@ from helpers import blob, motion, move, pose_error
 import jaxreg as jr
 from jaxreg import Status
 from jaxreg.datasets import sculpture_scans
+from jaxreg.multiview import RelativeMotions
 
 
 FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64, max_points=1024)
+
+MOTIONS = RelativeMotions(
+    jnp.array([[2, 8]]), jnp.eye(4)[None], jnp.ones(1), jnp.ones(1)
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,18 +36,19 @@ def _errors(sol, truth):
 
 @pytest.fixture(scope="module")
 def solved(sculpture):
-    calls = []
+    calls, found = [], []
     sol = jr.reconstruct(
         sculpture[0],
         key=jax.random.key(0),
         method=FILTER,
         progress=lambda *call: calls.append(call),
+        on_pairs=found.append,
     )
-    return sol, calls
+    return sol, calls, found
 
 
 def test_all_scans_are_placed_without_a_guess(sculpture, solved):
-    sol, _ = solved
+    sol, _, _ = solved
     assert int(sol.status) == Status.CONVERGED
     assert np.all(sol.placed)
     errors = np.array(_errors(sol, sculpture[1]))
@@ -51,7 +58,7 @@ def test_all_scans_are_placed_without_a_guess(sculpture, solved):
 
 
 def test_every_pair_is_reported_with_what_is_known_of_it(sculpture, solved):
-    sol, _ = solved
+    sol, _, _ = solved
     assert sol.graph.num_edges == 28
     trusted = np.asarray(sol.edge_weight) > 0.5
     assert trusted.sum() >= 7
@@ -63,7 +70,7 @@ def test_every_pair_is_reported_with_what_is_known_of_it(sculpture, solved):
 
 
 def test_progress_names_stages_and_ends_at_the_total(solved):
-    _, calls = solved
+    _, calls, _ = solved
     stages = list(dict.fromkeys(stage for stage, _, _ in calls))
     assert stages == [
         "preparing scans",
@@ -90,6 +97,51 @@ def test_one_program_under_jit_gives_the_same_poses(sculpture, solved):
         angle, shift = pose_error(T, expected)
         assert angle < 2e-3
         assert shift < 5e-4
+
+
+def test_an_interrupted_run_goes_on_to_the_same_answer(sculpture, solved):
+    sol, _, found = solved
+    kept, new = RelativeMotions.joined(found[2:]), []
+    again = jr.reconstruct(
+        sculpture[0],
+        key=jax.random.key(0),
+        method=FILTER,
+        previous=kept,
+        on_pairs=new.append,
+    )
+    assert sum(len(x.overlap) for x in new) == 28 - len(kept.overlap) > 0
+    np.testing.assert_array_equal(again.graph.edges, sol.graph.edges)
+    np.testing.assert_allclose(again.T_world_i, sol.T_world_i, atol=1e-5)
+
+
+def test_a_new_scan_joins_an_earlier_solution(sculpture, solved):
+    sol, _, _ = solved
+    old = np.flatnonzero(np.max(sol.graph.edges, axis=1) < 7)
+    earlier = eqx.tree_at(
+        lambda s: (s.T_world_i, s.scan_status, s.placed, s.num_dropped),
+        jax.tree.map(lambda x: x[old] if x.shape[:1] == (28,) else x, sol),
+        (sol.T_world_i[:7], sol.scan_status[:7], sol.placed[:7], sol.num_dropped[:7]),
+    )
+    new = []
+    again = jr.reconstruct(
+        sculpture[0],
+        key=jax.random.key(0),
+        method=FILTER,
+        previous=earlier,
+        on_pairs=new.append,
+    )
+    pairs = np.concatenate([x.pairs for x in new])
+    np.testing.assert_array_equal(pairs, [[i, 7] for i in range(7)])
+    np.testing.assert_allclose(again.T_world_i, sol.T_world_i, atol=1e-5)
+
+
+def test_a_sequence_takes_fewer_pairs(sculpture):
+    scans, truth = sculpture
+    key = jax.random.key(0)
+    sol = jr.reconstruct(scans, key=key, method=FILTER, order="sequential")
+    assert np.all(sol.placed)
+    assert sol.overlap.shape[0] < 20  # of 28
+    assert np.array(_errors(sol, truth))[:, 0].max() < 0.02
 
 
 def test_bad_scans_are_reported_and_the_others_placed(sculpture):
@@ -146,3 +198,16 @@ def test_floor_plans_in_the_plane():
 def test_wrong_scans_are_named(scans, words):
     with pytest.raises(ValueError, match=words):
         jr.reconstruct(scans, key=jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"order": "random"}, ValueError, "order: wanted 'any' or 'sequential'"),
+        ({"previous": 3}, TypeError, "previous: wanted a Reconstr.*found int"),
+        ({"previous": MOTIONS}, ValueError, "previous: of 9 scans, but there are 8"),
+    ],
+)
+def test_wrong_options_are_named(sculpture, options, error, words):
+    with pytest.raises(error, match=words):
+        jr.reconstruct(sculpture[0], key=jax.random.key(0), method=FILTER, **options)
