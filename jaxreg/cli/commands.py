@@ -6,6 +6,7 @@ import tyro
 
 from jaxreg.cli.average import Average
 from jaxreg.cli.demo import Demo
+from jaxreg.cli.info import Info
 from jaxreg.cli.multiview import Multiview
 from jaxreg.cli.register import Register
 
@@ -15,4 +16,5 @@ COMMANDS = (
     | Annotated[Register, tyro.conf.subcommand("register")]
     | Annotated[Multiview, tyro.conf.subcommand("multiview")]
     | Annotated[Average, tyro.conf.subcommand("average")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
 )

@@ -62,5 +62,7 @@ def _run(arguments: list[str]) -> int:
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     runtime.keep_compiled_programs()
+    if isinstance(command, commands.Info):
+        return command.run()
     line = shlex.join(["jaxreg", *arguments])
     return command.run(runtime.Session(command, line))

@@ -24,6 +24,7 @@ from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
 
 _VERTEX = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
 _EDGE = {"EDGE_SE2": 9, "EDGE_SE3:QUAT": 28}
+KINDS = (*_VERTEX, *_EDGE, "FIX")
 
 
 class _Rows(NamedTuple):
@@ -184,11 +185,7 @@ def _parse(path: Path) -> _File:
         words = line.split()
         if words and not words[0].startswith("#"):
             found[words[0]].append((number, words[1:]))
-    unknown = {
-        tag: len(rows)
-        for tag, rows in found.items()
-        if tag not in _VERTEX and tag not in _EDGE and tag != "FIX"
-    }
+    unknown = {tag: len(rows) for tag, rows in found.items() if tag not in KINDS}
     if unknown:
         counts = ", ".join(f"{n} x {tag}" for tag, n in unknown.items())
         warnings.warn(

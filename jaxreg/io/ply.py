@@ -10,12 +10,12 @@ from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError, MissingExtraError
 
 
-def parse_ply(data: bytes, path: Path) -> np.ndarray:
-    """The vertices of a PLY file, `(n, d)`; `path` is for messages only.
+def parse_ply(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The vertices of a PLY file; `path` is for messages only.
 
     Returns:
-        float32 unless the file stores float64 coordinates; 2D if the vertices have no
-        property z.
+        `(n, d)` float32 unless the file stores float64 coordinates, 2D if the vertices
+        have no property z; the names of the properties of a vertex.
 
     Raises:
         InputError: if the data are no PLY file or hold no vertices.
@@ -24,7 +24,8 @@ def parse_ply(data: bytes, path: Path) -> np.ndarray:
     plyfile = _plyfile()
     try:
         vertex = plyfile.PlyData.read(io.BytesIO(data))["vertex"].data
-        names = ("x", "y", "z") if "z" in (vertex.dtype.names or ()) else ("x", "y")
+        fields = tuple(vertex.dtype.names or ())
+        names = ("x", "y", "z") if "z" in fields else ("x", "y")
         columns = [np.asarray(vertex[name]) for name in names]
     except (plyfile.PlyParseError, ValueError, KeyError, EOFError, TypeError) as err:
         raise InputError(
@@ -34,7 +35,8 @@ def parse_ply(data: bytes, path: Path) -> np.ndarray:
     if len(columns[0]) == 0:
         raise InputError(f"{path}: holds no points.\nExport or copy the scan again.")
     wide = any(c.dtype.kind != "f" or c.dtype.itemsize > 4 for c in columns)
-    return np.stack(columns, axis=1).astype(np.float64 if wide else np.float32)
+    points = np.stack(columns, axis=1).astype(np.float64 if wide else np.float32)
+    return points, fields
 
 
 def write_ply(

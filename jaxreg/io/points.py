@@ -1,22 +1,33 @@
 """Reading point sets: one entry point that goes by the suffix of the file."""
 
 import gzip
-import io
 import re
-import zipfile
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxreg.io import ply, text
+from jaxreg.io import arrays, ply, text
 from jaxreg.io.errors import InputError
 
 
 TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
 SUFFIXES = (".ply", ".npy", ".npz", *TEXT)
 _FORMATS = "PLY, XYZ/CSV/TXT text (each also .gz), NPY or NPZ"
+
+
+class NamedPoints(NamedTuple):
+    """Points as read.
+
+    Attributes:
+        points: `(n, d)` float32 or float64, rows with NaN or inf included.
+        fields: names of the columns or properties of the file, empty if it has none.
+    """
+
+    points: np.ndarray
+    fields: tuple[str, ...] = ()
 
 
 def read_points(path: str | Path) -> np.ndarray:
@@ -38,18 +49,14 @@ def read_points(path: str | Path) -> np.ndarray:
         InputError: if the file is missing, unreadable, empty, or holds no points.
         MissingExtraError: if the file is PLY and plyfile is not installed.
     """
-    path, key = _split_key(path)
-    if _suffix(path) != ".npz":
-        return _read_file(path)
-    scans = _read_npz(path)
-    if key is None and len(scans) > 1:
+    bare, key = _split_key(path)
+    scans = read_named(path)
+    if len(scans) > 1:
         raise InputError(
-            f"{path}: holds {len(scans)} scans: {_listing(scans)}.\n"
-            f"Name one of them, for example {path}:{next(iter(scans))}"
+            f"{bare}: holds {len(scans)} scans: {_listing(scans)}.\n"
+            f"Name one of them, for example {bare}:{next(iter(scans))}"
         )
-    if key is not None and key not in scans:
-        raise InputError(f"{path}: has no scan {key}.\nIt holds: {_listing(scans)}.")
-    return scans[key] if key is not None else next(iter(scans.values()))
+    return next(iter(scans.values())).points
 
 
 def read_scans(
@@ -72,15 +79,51 @@ def read_scans(
     names: list[str] = []
     scans: list[np.ndarray] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
-        for file in _expand(Path(path)):
-            bare, key = _split_key(file)
-            if _suffix(bare) == ".npz" and key is None:
-                found = _read_npz(bare)
-            else:
-                found = {key or stem(bare): read_points(file)}
+        for file in point_files(path):
+            found = read_named(file)
             names += found.keys()
-            scans += found.values()
+            scans += [scan.points for scan in found.values()]
     return unique_names(names), scans
+
+
+def read_named(path: str | Path) -> dict[str, NamedPoints]:
+    """Reads all scans of one file by name, that of the file if there is but one.
+
+    Args:
+        path: a file as for `read_points`, an archive with or without `:KEY`.
+
+    Raises:
+        InputError: as `read_points`.
+    """
+    bare, key = _split_key(path)
+    if _suffix(bare) != ".npz":
+        return {stem(bare): _read_file(bare)}
+    data = _read_bytes(bare)
+    scans = {k: NamedPoints(x) for k, x in arrays.parse_npz(data, bare).items()}
+    if key is not None and key not in scans:
+        raise InputError(f"{bare}: has no scan {key}.\nIt holds: {_listing(scans)}.")
+    return scans if key is None else {key: scans[key]}
+
+
+def point_files(path: str | Path) -> list[Path]:
+    """The point files of a folder in natural order; a file stands for itself.
+
+    Raises:
+        InputError: if a folder holds no point file.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    files = [
+        f
+        for f in path.iterdir()
+        if f.is_file() and not f.name.startswith(".") and _suffix(f) in SUFFIXES
+    ]
+    if not files:
+        raise InputError(
+            f"{path}: the folder holds no point files.\nWanted {_FORMATS}."
+        )
+    return sorted(files, key=lambda f: _natural(f.name))
 
 
 def stem(path: str | Path) -> str:
@@ -90,7 +133,7 @@ def stem(path: str | Path) -> str:
     return name[: -len(Path(name).suffix)] if Path(name).suffix else name
 
 
-def _read_file(path: Path) -> np.ndarray:
+def _read_file(path: Path) -> NamedPoints:
     suffix = _suffix(path)
     if suffix not in SUFFIXES:
         raise InputError(
@@ -99,12 +142,10 @@ def _read_file(path: Path) -> np.ndarray:
         )
     data = _read_bytes(path)
     if suffix == ".ply":
-        points = ply.parse_ply(data, path)
-    elif suffix == ".npy":
-        points = _as_points(_load_npy(data, path), str(path))
-    else:
-        points = text.parse_text(data, path)
-    return points
+        return NamedPoints(*ply.parse_ply(data, path))
+    if suffix == ".npy":
+        return NamedPoints(arrays.parse_npy(data, path))
+    return NamedPoints(text.parse_text(data, path), text.columns(data))
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -122,61 +163,6 @@ def _read_bytes(path: Path) -> bytes:
     if not data:
         raise InputError(f"{path}: the file is empty.\nExport or copy the scan again.")
     return data
-
-
-def _load_npy(data: bytes, path: Path) -> np.ndarray:
-    try:
-        return np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as err:
-        raise InputError(
-            f"{path}: not a NumPy file of plain numbers.\n"
-            "Save it with numpy.save as one float array of shape (n, 3) or (n, 2)."
-        ) from err
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    data = _read_bytes(path)
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            arrays = {
-                stem(name): np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
-                for name in archive.namelist()
-            }
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error) as err:
-        raise InputError(
-            f"{path}: not an NPZ file of plain numbers.\n"
-            "Save it with numpy.savez(file, name=points, ...)."
-        ) from err
-    if not arrays:
-        raise InputError(f"{path}: holds no arrays.\nSave each scan under a name.")
-    return {key: _as_points(a, f"{path}:{key}") for key, a in arrays.items()}
-
-
-def _as_points(array: np.ndarray, name: str) -> np.ndarray:
-    if array.ndim != 2 or array.shape[1] not in (2, 3) or array.dtype.kind not in "fiu":
-        raise InputError(
-            f"{name}: found an array of shape {array.shape} and type {array.dtype}.\n"
-            "Wanted numbers of shape (n, 3) or (n, 2), one point a row."
-        )
-    if array.shape[0] == 0:
-        raise InputError(f"{name}: holds no points.\nExport or copy the scan again.")
-    narrow = array.dtype.kind == "f" and array.dtype.itemsize <= 4
-    return array.astype(np.float32 if narrow else np.float64)
-
-
-def _expand(path: Path) -> list[Path]:
-    if not path.is_dir():
-        return [path]
-    files = [
-        f
-        for f in path.iterdir()
-        if f.is_file() and not f.name.startswith(".") and _suffix(f) in SUFFIXES
-    ]
-    if not files:
-        raise InputError(
-            f"{path}: the folder holds no point files.\nWanted {_FORMATS}."
-        )
-    return sorted(files, key=lambda f: _natural(f.name))
 
 
 def _split_key(path: str | Path) -> tuple[Path, str | None]:
@@ -206,6 +192,6 @@ def unique_names(names: list[str]) -> list[str]:
     return out
 
 
-def _listing(scans: dict[str, np.ndarray]) -> str:
+def _listing(scans: dict[str, NamedPoints]) -> str:
     names = list(scans)
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")

@@ -36,6 +36,18 @@ def parse_text(data: bytes, path: Path) -> np.ndarray:
     return np.array(rows, dtype=np.float64)
 
 
+def columns(data: bytes) -> tuple[str, ...]:
+    """The words of the header line of a text file, if it has one for every column."""
+    lines = data[:100_000].decode("utf-8-sig", errors="replace").splitlines()
+    head, *rest = [s for s in lines if not _COMMENT.match(s)][:2]
+    if not rest:
+        return ()
+    separator = _separator(rest[0])
+    words = [cell.strip() for cell in _cells(head, separator)]
+    named = len(words) == len(_cells(rest[0], separator))
+    return tuple(words) if named and not any(map(_is_number, words)) else ()
+
+
 def _first_row(numbered: list[tuple[int, str]], path: Path) -> int:
     for k, (_, line) in enumerate(numbered[:2]):
         if len(_numeric_columns(line, _separator(line))) >= 2:
