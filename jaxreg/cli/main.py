@@ -65,4 +65,7 @@ def _run(arguments: list[str]) -> int:
     if isinstance(command, commands.Info):
         return command.run()
     line = shlex.join(["jaxreg", *arguments])
-    return command.run(runtime.Session(command, line))
+    code = command.run(runtime.Session(command, line))
+    if command.json:
+        sys.stdout.write((command.out / "result.json").read_text(encoding="utf-8"))
+    return code

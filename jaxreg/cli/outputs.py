@@ -106,9 +106,8 @@ def page_or_message(session: Session) -> Iterator[None]:
 def page_details(session: Session, document: dict[str, Any]) -> dict[str, Any]:
     """What the page tells of how a result was made: part of the document, settings."""
     options = dataclasses.asdict(session.options)
-    settings = {
-        k: _setting(v) for k, v in options.items() if k not in ("seed", "quiet", "out")
-    }
+    unshown = ("seed", "quiet", "json", "out")
+    settings = {k: _setting(v) for k, v in options.items() if k not in unshown}
     keys = ("command", "seed", "times_s", "versions")
     return {k: document[k] for k in keys} | {"settings": settings}
 

@@ -33,6 +33,8 @@ class Options:
     """Of the random numbers; the same seed gives the same result."""
     quiet: bool = False
     """Print nothing but errors."""
+    json: bool = False
+    """Print the content of result.json to standard output, and nothing else there."""
 
     def key(self) -> jax.Array:
         """The key that the seed stands for."""
@@ -48,7 +50,9 @@ class Session:
         self.options = options
         self.command = command
         self.times: dict[str, float] = {}
-        self.console = Console(quiet=options.quiet, highlight=False, markup=False)
+        self.console = Console(
+            quiet=options.quiet or options.json, highlight=False, markup=False
+        )
 
     @contextlib.contextmanager
     def timed(self, part: str, computes: bool = False) -> Iterator[None]:

@@ -230,25 +230,26 @@ def _modes(T: np.ndarray) -> SimpleNamespace:
     )
 
 
+def _register_s1_onto_s0(source: np.ndarray, target: np.ndarray, *, key: Any) -> Any:
+    assert np.isfinite(source).all()
+    T = _shift(-np.median(CLOUD, axis=0)) @ POSES[1] @ _shift(_middle_of(POSES[1]))
+    return SimpleNamespace(
+        T_target_source=jnp.asarray(T),
+        status=jnp.asarray(0),
+        fitness=jnp.asarray(0.95),
+        overlap=jnp.asarray(0.93),
+        inlier_rmse=jnp.asarray(0.02),
+        covariance=1e-6 * jnp.eye(6),
+        modes=_modes(T),
+    )
+
+
 def test_register_writes_the_motion_between_the_files(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     _save_scans(folder)
 
-    def register(source: np.ndarray, target: np.ndarray, *, key: Any) -> Any:
-        assert np.isfinite(source).all()
-        T = _shift(-np.median(CLOUD, axis=0)) @ POSES[1] @ _shift(_middle_of(POSES[1]))
-        return SimpleNamespace(
-            T_target_source=jnp.asarray(T),
-            status=jnp.asarray(0),
-            fitness=jnp.asarray(0.95),
-            overlap=jnp.asarray(0.93),
-            inlier_rmse=jnp.asarray(0.02),
-            covariance=1e-6 * jnp.eye(6),
-            modes=_modes(T),
-        )
-
-    monkeypatch.setattr(jaxreg, "register", register)
+    monkeypatch.setattr(jaxreg, "register", _register_s1_onto_s0)
     assert main(["register", "s1.npy", "s0.npy"]) == 0
     assert sorted(os.listdir("jaxreg-out")) == FILES
     found = json.loads(Path("jaxreg-out/result.json").read_text())
@@ -428,6 +429,41 @@ def test_quiet_prints_nothing(
     assert main(["multiview", *scans, "--quiet"]) == 0
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == ("", "")
+
+
+@pytest.mark.parametrize("command", ["multiview", "register", "average", "demo"])
+def test_json_is_all_that_goes_to_standard_output(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+):
+    scans = _save_scans(folder)
+    (folder / "g.g2o").write_text(GRAPH)
+    _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    monkeypatch.setattr(jaxreg, "register", _register_s1_onto_s0)
+    monkeypatch.setattr(
+        "jaxreg.cli.demo.sculpture_scans",
+        lambda num, seed: ([_seen_from(T) for T in POSES], POSES),
+    )
+    given = {"multiview": scans, "register": scans[1::-1], "average": ["g.g2o"]}
+    assert main([command, *given.get(command, []), "--json"]) == 0
+    captured = capsys.readouterr()
+    found = json.loads(captured.out)
+    assert found["status"] == "CONVERGED"
+    assert found == json.loads(Path("jaxreg-out/result.json").read_text())
+    assert captured.err == ""
+
+
+def test_json_of_a_failure_is_silent_on_standard_output(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)[:2]
+    _fake_reconstruct(monkeypatch, POSES, [True, False])
+    assert main(["multiview", *scans, "--json"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "no two scans could be joined" in captured.err
 
 
 def test_without_plotly_the_other_files_are_written(
