@@ -23,7 +23,7 @@ class Register(Options):
     """Move one scan onto another, without an initial guess."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
-    """The scan that moves: PLY, XYZ, CSV, TXT, NPY, or FILE.npz:KEY."""
+    """The scan that moves: PLY, XYZ, PCD, LAS, OBJ, ..., or FILE.npz:KEY."""
     target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
     """The scan that stays; its frame is that of the result."""
 

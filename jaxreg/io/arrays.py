@@ -23,7 +23,7 @@ def parse_npy(data: bytes, path: Path) -> np.ndarray:
             f"{path}: not a NumPy file of plain numbers.\n"
             "Save it with numpy.save as one float array of shape (n, 3) or (n, 2)."
         ) from err
-    return _as_points(array, str(path))
+    return as_points(array, str(path))
 
 
 def parse_npz(data: bytes, path: Path) -> dict[str, np.ndarray]:
@@ -47,10 +47,15 @@ def parse_npz(data: bytes, path: Path) -> dict[str, np.ndarray]:
         ) from err
     if not arrays:
         raise InputError(f"{path}: holds no arrays.\nSave each scan under a name.")
-    return {key: _as_points(a, f"{path}:{key}") for key, a in arrays.items()}
+    return {key: as_points(a, f"{path}:{key}") for key, a in arrays.items()}
 
 
-def _as_points(array: np.ndarray, name: str) -> np.ndarray:
+def as_points(array: np.ndarray, name: str) -> np.ndarray:
+    """The array as float32 or float64 points; `name` is for messages only.
+
+    Raises:
+        InputError: unless it holds numbers of shape `(n, 2)` or `(n, 3)`, n > 0.
+    """
     if array.ndim != 2 or array.shape[1] not in (2, 3) or array.dtype.kind not in "fiu":
         raise InputError(
             f"{name}: found an array of shape {array.shape} and type {array.dtype}.\n"

@@ -17,8 +17,19 @@ from jaxreg.io.toro import read_toro
 
 
 GRAPHS = (".g2o", ".g2o.gz", ".graph")
-_NORMALS = ({"nx", "ny", "nz"}, {"normal_x", "normal_y", "normal_z"})
-_COLORS = ({"red", "green", "blue"}, {"r", "g", "b"}, {"rgb"}, {"rgba"})
+# As PLY, PCD and E57 call them, in lower case.
+_NORMALS = (
+    {"nx", "ny", "nz"},
+    {"normal_x", "normal_y", "normal_z"},
+    {"nor:normalx", "nor:normaly", "nor:normalz"},
+)
+_COLORS = (
+    {"red", "green", "blue"},
+    {"r", "g", "b"},
+    {"rgb"},
+    {"rgba"},
+    {"colorred", "colorgreen", "colorblue"},
+)
 
 
 @dataclass(frozen=True)

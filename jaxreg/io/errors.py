@@ -6,10 +6,10 @@ class InputError(ValueError):
 
 
 class MissingExtraError(ImportError):
-    """A package of the optional extra `app` is not installed."""
+    """A package of an optional extra, `app` or `formats`, is not installed."""
 
-    def __init__(self, package: str, purpose: str):
+    def __init__(self, package: str, purpose: str, extra: str = "app"):
         super().__init__(
             f"{purpose} needs the package {package}, which is not installed.\n"
-            "Install it with: python -m pip install 'jaxreg[app]'"
+            f"Install it with: python -m pip install 'jaxreg[{extra}]'"
         )

@@ -9,13 +9,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxreg.io import arrays, ply, text
+from jaxreg.io import arrays, e57, las, meshes, pcd, ply, text
+from jaxreg.io.content import require_suffix
 from jaxreg.io.errors import InputError
 
 
 TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
-SUFFIXES = (".ply", ".npy", ".npz", *TEXT)
-_FORMATS = "PLY, XYZ/CSV/TXT text (each also .gz), NPY or NPZ"
+_PARSERS = {
+    ".ply": ply.parse_ply,
+    ".pcd": pcd.parse_pcd,
+    ".las": las.parse_las,
+    ".laz": las.parse_las,
+    ".obj": meshes.parse_obj,
+    ".stl": meshes.parse_stl,
+}
+ARCHIVES = (".npz", ".e57")
+SUFFIXES = (".npy", *_PARSERS, *ARCHIVES, *TEXT)
+_NEVER_PACKED = (".npy", *ARCHIVES, "")
+_FORMATS = (
+    "PLY, XYZ/CSV/TXT text, PCD, LAS/LAZ, OBJ, STL (each also .gz), E57, NPY, NPZ"
+)
 
 
 class NamedPoints(NamedTuple):
@@ -33,21 +46,23 @@ class NamedPoints(NamedTuple):
 def read_points(path: str | Path) -> np.ndarray:
     """Reads one point set.
 
-    PLY (binary or ASCII, through plyfile) and text files may be compressed (`.gz`).
-    Text is separated by commas, semicolons or white space, with or without a header
-    line; the first three numeric columns are taken, or both if there are two. One scan
-    of an NPZ file that holds several is named as `FILE.npz:KEY`.
+    PLY (binary or ASCII, through plyfile), PCD, LAS, LAZ, the vertices of OBJ and STL,
+    and text files; all of these may be compressed (`.gz`). Text is separated by commas,
+    semicolons or white space, with or without a header line; the first three numeric
+    columns are taken, or both if there are two. NPY, NPZ and E57; one scan of an NPZ or
+    E57 file that holds several is named as `FILE.npz:KEY`.
 
     Args:
         path: the file.
 
     Returns:
-        `(n, d)` array, d = 2 or 3, float32 if the file holds float32, else float64, in
-        the unit of the file. Rows with NaN or inf are kept.
+        `(n, d)` array, d = 2 or 3, float32 if the file holds float32, else float64 (as
+        for LAS, LAZ and E57), in the unit of the file. Rows with NaN or inf are kept.
 
     Raises:
         InputError: if the file is missing, unreadable, empty, or holds no points.
-        MissingExtraError: if the file is PLY and plyfile is not installed.
+        MissingExtraError: if the package that reads this kind is not installed: plyfile
+            of the extra `app`, or one of the extra `formats`.
     """
     bare, key = _split_key(path)
     scans = read_named(path)
@@ -65,9 +80,9 @@ def read_scans(
     """Reads scans from files, NPZ archives and folders, in the order given.
 
     Args:
-        paths: each is a file as for `read_points`, an NPZ file of which every key is a
-            scan, or a folder, of which all point files are read in natural order
-            (`scan2` before `scan10`).
+        paths: each is a file as for `read_points`, an NPZ or E57 file of which every
+            scan is read, or a folder, of which all point files are read in natural
+            order (`scan2` before `scan10`).
 
     Returns:
         Names, made of file names without suffix or NPZ keys and unique, and as many
@@ -96,10 +111,11 @@ def read_named(path: str | Path) -> dict[str, NamedPoints]:
         InputError: as `read_points`.
     """
     bare, key = _split_key(path)
-    if _suffix(bare) != ".npz":
+    if _suffix(bare) not in ARCHIVES:
         return {stem(bare): _read_file(bare)}
-    data = _read_bytes(bare)
-    scans = {k: NamedPoints(x) for k, x in arrays.parse_npz(data, bare).items()}
+    scans = _read_archive(bare)
+    if key is None and len(scans) == 1 and _suffix(bare) == ".e57":
+        return {stem(bare): next(iter(scans.values()))}  # scanners name all alike
     if key is not None and key not in scans:
         raise InputError(f"{bare}: has no scan {key}.\nIt holds: {_listing(scans)}.")
     return scans if key is None else {key: scans[key]}
@@ -141,16 +157,27 @@ def _read_file(path: Path) -> NamedPoints:
             f"Wanted {_FORMATS}."
         )
     data = _read_bytes(path)
-    if suffix == ".ply":
-        return NamedPoints(*ply.parse_ply(data, path))
+    require_suffix(data, suffix, path)
+    if suffix in _PARSERS:
+        return NamedPoints(*_PARSERS[suffix](data, path))
     if suffix == ".npy":
         return NamedPoints(arrays.parse_npy(data, path))
     return NamedPoints(text.parse_text(data, path), text.columns(data))
 
 
-def _read_bytes(path: Path) -> bytes:
+def _read_archive(path: Path) -> dict[str, NamedPoints]:
+    suffix = _suffix(path)
+    data = _read_bytes(path, 16 if suffix == ".e57" else -1)
+    require_suffix(data, suffix, path)
+    if suffix == ".npz":
+        return {k: NamedPoints(x) for k, x in arrays.parse_npz(data, path).items()}
+    return {name: NamedPoints(*scan) for name, scan in e57.read_e57(path).items()}
+
+
+def _read_bytes(path: Path, limit: int = -1) -> bytes:
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(limit)
         if path.name.lower().endswith(".gz") and data:
             data = gzip.decompress(data)
     except FileNotFoundError as err:
@@ -166,7 +193,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _split_key(path: str | Path) -> tuple[Path, str | None]:
-    match = re.fullmatch(r"(.*\.npz):([^/\\]+)", str(path), re.IGNORECASE)
+    match = re.fullmatch(r"(.*\.(?:npz|e57)):([^/\\]+)", str(path), re.IGNORECASE)
     return (Path(match[1]), match[2]) if match else (Path(path), None)
 
 
@@ -174,7 +201,7 @@ def _suffix(path: Path) -> str:
     name = path.name.lower()
     packed = name.endswith(".gz")
     suffix = Path(name[:-3] if packed else name).suffix
-    return suffix + ".gz" if packed and suffix in (".npy", ".npz", "") else suffix
+    return suffix + ".gz" if packed and suffix in _NEVER_PACKED else suffix
 
 
 def _natural(name: str) -> list[tuple[int, int | str]]:

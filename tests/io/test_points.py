@@ -149,7 +149,7 @@ BAD = {
     "ply of no vertices": ("a.ply", PLY_HEAD.replace(b"3", b"0") + b"end_header\n"),
     "not npy": ("a.npy", b"1 2 3\n"),
     "not npz": ("a.npz", b"1 2 3\n"),
-    "unknown suffix": ("a.stl", b"solid\n"),
+    "unknown suffix": ("a.doc", b"1 2 3\n"),
     "no suffix": ("a", b"1 2 3\n"),
 }
 
