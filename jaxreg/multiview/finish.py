@@ -2,21 +2,21 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxreg._core.status import Status
+from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
 from jaxreg.multiview.place import Placement, place
-from jaxreg.multiview.refine import refine_jointly
+from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative import RelativeMotions
 from jaxreg.multiview.scans import PreparedScans
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.particle import ParticleFilter
 
 
-@eqx.filter_jit
 def finish(
     method: ParticleFilter,
     averaging: AbstractAverager | None,
@@ -33,9 +33,18 @@ def finish(
     """
     min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
     placement = place(motions, scans.num_scans, averaging, min_overlap)
-    T_centred = refine_jointly(
-        scans, placement.T_world_i, placement.placed, min_overlap / 2
-    )
+    placement = refine(scans, placement, averaging, min_overlap / 2)
+    return _solution(scans, motions, placement, min_overlap)
+
+
+@eqx.filter_jit
+def _solution(
+    scans: PreparedScans,
+    motions: RelativeMotions,
+    placement: Placement,
+    min_overlap: Scalar,
+) -> ReconstructionSolution:
+    """In the frames and unit of the input."""
     weight = jnp.where(motions.overlap >= min_overlap, motions.overlap, 0)
     found = motions.in_input_frames(scans)
     real = motions.pairs[:, 0] != motions.pairs[:, 1]
@@ -44,7 +53,7 @@ def finish(
     scan_status = jnp.where(placed, Status.CONVERGED, Status.LOW_OVERLAP)
     scan_status = jnp.where(scans.enough, scan_status, Status.TOO_FEW_POINTS)
     return ReconstructionSolution(
-        T_world_i=_in_first_frame(scans, T_centred, placement),
+        T_world_i=_in_first_frame(scans, placement),
         status=jnp.where(jnp.all(placed), Status.CONVERGED, Status.DISCONNECTED).astype(
             jnp.int32
         ),
@@ -52,7 +61,7 @@ def finish(
         placed=placed,
         graph=graph,
         overlap=motions.overlap,
-        edge_weight=_trust(scans, motions, T_centred, placed, weight),
+        edge_weight=_trust(scans, motions, placement, weight),
         inlier_rmse=found.inlier_rmse,
         num_dropped=scans.num_dropped,
     )
@@ -61,12 +70,12 @@ def finish(
 def _trust(
     scans: PreparedScans,
     motions: RelativeMotions,
-    T_world_i: Float[Array, "v D D"],
-    placed: Bool[Array, " v"],
+    placement: Placement,
     weight: Float[Array, " e"],
 ) -> Float[Array, " e"]:
     """Agreement of the pairs' motions with the poses; the centred radius is one."""
     i, j = motions.pairs[:, 0], motions.pairs[:, 1]
+    T_world_i, placed = placement.T_world_i, placement.placed
     T_error = lie.inverse(T_world_i[i]) @ T_world_i[j] @ lie.inverse(motions.T_i_j)
     turn = lie.rotation_angle(lie.rotation(T_error))
     centre = lie.translation(lie.inverse(T_world_i[i]) @ T_world_i[j])
@@ -78,12 +87,12 @@ def _trust(
 
 
 def _in_first_frame(
-    scans: PreparedScans, T_centred: Array, placement: Placement
+    scans: PreparedScans, placement: Placement
 ) -> Float[Array, "v D D"]:
     """Poses relative to the first placed scan, in the input's frames and unit."""
     first = jnp.argmax(placement.placed).astype(jnp.int32)
     ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
-    T_first_i = lie.inverse(T_centred[first]) @ T_centred
+    T_first_i = lie.inverse(placement.T_world_i[first]) @ placement.T_world_i
     T = scans.to_input_frames(T_first_i, jnp.full_like(ids, first), ids)
     eye = jnp.eye(T.shape[-1], dtype=T.dtype)
     keep = placement.placed & (ids != first)
