@@ -3,6 +3,7 @@
 Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted.
 """
 
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -10,6 +11,9 @@ from importlib.util import find_spec
 
 from jaxreg.io.errors import InputError, MissingExtraError
 from jaxreg.io.result import version
+
+
+_COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -44,9 +48,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: list[str]) -> int:
     # All of them now: nobody wants to learn it when the results are to be written.
-    for package in ("tyro", "rich", "plyfile", "matplotlib"):
+    for package in ("tyro", "shtab", "rich", "plyfile", "matplotlib"):
         if find_spec(package) is None:
             raise MissingExtraError(package, "The command line")
+    if any(word.startswith(_COMPLETION) for word in arguments):
+        # Of tyro's two generators this one, by shtab, completes names of scans too.
+        os.environ["PYTHON_TYRO_BACKEND"] = "argparse"
     import tyro
 
     from jaxreg.cli import commands, runtime

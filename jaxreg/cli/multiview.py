@@ -37,7 +37,7 @@ class Multiview(Options):
     scans: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN ...")
     ]
-    """Two or more files (PLY, XYZ, PCD, LAS, E57, ...), a folder, or an NPZ of scans."""
+    """Files (PLY, XYZ, PCD, LAS, ...), a folder of these, or an archive (NPZ, E57)."""
     truth: Path | None = None
     """Pose file of the Stanford repository (.conf, metres): adds a table of errors."""
     order: Literal["any", "sequential"] = "any"

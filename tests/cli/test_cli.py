@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -493,6 +494,57 @@ def test_python_m_jaxreg_is_the_command(tmp_path: Path):
     assert done.returncode == 2
     assert "none.ply: no such file" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [
+        (["average", "g.g2o", "--metod", "plain"], "--method"),
+        (["multiview", "--sed", "3"], "--seed"),
+        (["registr", "a", "b"], "register"),
+    ],
+)
+def test_a_wrong_word_suggests_the_right_one(
+    capsys: pytest.CaptureFixture[str], wrong: list[str], meant: str
+):
+    with pytest.raises(SystemExit) as caught:
+        main(wrong)
+    assert caught.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert meant in captured.err
+
+
+COMPLETE = """\
+source ./completion
+function=$(complete -p jaxreg | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+try() {
+  COMP_WORDS=(jaxreg "$@") COMP_CWORD=$# COMPREPLY=()
+  $function jaxreg "${@: -1}" ""
+  echo "${COMPREPLY[@]}"
+}
+try multiv; try average --meth; try average --method c; try multiview a.ply b
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+def test_bash_completes_commands_options_choices_and_files(tmp_path: Path):
+    command = [sys.executable, "-m", "jaxreg", "--tyro-print-completion", "bash"]
+    script = subprocess.run(
+        command, capture_output=True, text=True, cwd=Path(__file__).parents[2]
+    )
+    assert (script.returncode, script.stderr) == (0, "")
+    (tmp_path / "completion").write_text(script.stdout)
+    (tmp_path / "bunny.ply").touch()
+    done = subprocess.run(
+        ["bash", "-c", COMPLETE], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.stdout.splitlines() == [
+        "multiview",
+        "--method",
+        "correntropy",
+        "bunny.ply",
+    ]
 
 
 GRAPH = """\
