@@ -3,6 +3,7 @@
 Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted.
 """
 
+import io
 import os
 import shlex
 import sys
@@ -29,6 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments in (["--version"], ["-V"]):
         sys.stdout.write(f"jaxreg {version('jaxreg')}\n")
         return 0
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names need not be UTF-8
     try:
         return _run(arguments)
     except (InputError, MissingExtraError) as err:
@@ -71,8 +74,10 @@ def _run(arguments: list[str]) -> int:
     runtime.keep_compiled_programs()
     if isinstance(command, commands.Info):
         return command.run()
-    line = shlex.join(["jaxreg", *arguments])
-    code = command.run(runtime.Session(command, line))
+    line = os.fsencode(shlex.join(["jaxreg", *arguments]))
+    code = command.run(
+        runtime.Session(command, line.decode("utf-8", "backslashreplace"))
+    )
     if command.json:
         sys.stdout.write((command.out / "result.json").read_text(encoding="utf-8"))
     return code

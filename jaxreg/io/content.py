@@ -26,7 +26,8 @@ def require_suffix(data: bytes, suffix: str, path: Path) -> None:
     """
     for start, kind, suffixes in _KINDS:
         if data.startswith(start) and suffix not in suffixes:
-            wanted = suffixes[0] if suffixes else f"{suffix}.gz"
+            packed = ".gz" if path.name.lower().endswith(".gz") else ""
+            wanted = suffixes[0] + packed if suffixes else f"{suffix}.gz"
             raise InputError(
                 f"{path}: {kind} file by its content, whatever its name says.\n"
                 f"Rename it to end in {wanted}."

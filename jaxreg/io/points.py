@@ -1,6 +1,7 @@
 """Reading point sets: one entry point that goes by the suffix of the file."""
 
 import gzip
+import os
 import re
 import zlib
 from collections.abc import Iterable
@@ -143,15 +144,18 @@ def point_files(path: str | Path) -> list[Path]:
 
 
 def stem(path: str | Path) -> str:
-    """The name of a file without its folder and without `.ply`, `.ply.gz` and such."""
-    name = Path(path).name
+    """The name of a file without its folder and without `.ply`, `.ply.gz` and such.
+
+    Bytes that are no UTF-8 are spelled out in ASCII, so that the name can be written.
+    """
+    name = os.fsencode(Path(path).name).decode("utf-8", "backslashreplace")
     name = name[:-3] if name.lower().endswith(".gz") else name
     return name[: -len(Path(name).suffix)] if Path(name).suffix else name
 
 
 def _read_file(path: Path) -> NamedPoints:
     suffix = _suffix(path)
-    if suffix not in SUFFIXES:
+    if suffix not in SUFFIXES and path.exists():
         raise InputError(
             f"{path}: unknown kind of file {suffix or '(no suffix)'}.\n"
             f"Wanted {_FORMATS}."

@@ -467,6 +467,21 @@ def test_json_of_a_failure_is_silent_on_standard_output(
     assert "no two scans could be joined" in captured.err
 
 
+def test_names_that_are_no_utf_8(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = [os.fsdecode(b"scan\xff%d.npy" % k) for k in range(3)]
+    for old, new in zip(_save_scans(folder), scans, strict=True):
+        os.rename(old, new)
+    _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans]) == 0
+    assert sorted(os.listdir("jaxreg-out")) == FILES
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    assert found["names"] == [rf"scan\xff{k}" for k in range(3)]
+    assert main(["info", *scans]) == 0
+    assert r"scan\udcff0.npy: 3D scan" in capsys.readouterr().out
+
+
 def test_without_plotly_the_other_files_are_written(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -192,6 +192,8 @@ def test_pickles_are_refused(tmp_path: Path):
 def test_missing_file_folder_without_points_and_unnamed_scan(tmp_path: Path):
     with pytest.raises(InputError, match="no such file"):
         read_points(tmp_path / "none.ply")
+    with pytest.raises(InputError, match="no such file"):
+        read_scans(tmp_path / "folder")
     (tmp_path / "sub").mkdir()
     with pytest.raises(InputError, match="no point files"):
         read_scans(tmp_path / "sub")
