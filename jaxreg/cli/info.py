@@ -1,6 +1,7 @@
 """`jaxreg info`: what files hold."""
 
 import json
+import math
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -108,7 +109,11 @@ def _lines(scan: ScanFacts) -> list[str]:
     if scan.fields:
         lines.append(f"  columns: {' '.join(scan.fields)}")
     for axis, low, high in zip("xyz", scan.low, scan.high, strict=False):
-        lines.append(f"  {axis}: {low:.6g} to {high:.6g}, extent {high - low:.4g}")
+        # Map coordinates differ only far behind the point.
+        size = max(scan.extent)
+        digits = max(0, 3 - math.floor(math.log10(size))) if size > 0 else 6
+        span = f"{low:.{digits}f} to {high:.{digits}f}"
+        lines.append(f"  {axis}: {span}, extent {high - low:.4g}")
     if scan.spacing is not None:
         lines.append(f"  median spacing: {scan.spacing:.3g}")
     if scan.non_finite:

@@ -119,6 +119,8 @@ def test_map_coordinates_in_float32_are_warned_of(
     hints = [f["scans"][0]["hint"] for f in found["files"]]
     assert all("map coordinates" in hint for hint in hints)
     assert ["float32 holds steps of 0.5" in hint for hint in hints] == [False, True]
+    assert main(["info", "far.npy"]) == 0
+    assert "x: 466123.000 to 466124.100, extent 1.1" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
