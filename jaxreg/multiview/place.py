@@ -55,7 +55,7 @@ def place(
     evidence of its own, so averaging starts from the spanning tree of largest overlap.
     """
     if averaging is None:
-        averaging = Correntropy(width="paper", initialiser=SpanningTree())
+        averaging = Correntropy(initialiser=SpanningTree())
     pairs = motions.pairs
     trusted = jnp.where(motions.overlap >= min_overlap, motions.overlap, 0)
     label = components(pairs, trusted, num_scans)

@@ -55,8 +55,8 @@ def reconstruct(
         scans: a list of `(n_i, d)` point sets, or a padded array `(v, n, d)`.
         key: a `jax.random.key`; the same key gives the same answer.
         method: the search between pairs, `ParticleFilter()` by default.
-        averaging: how relative motions become poses; None for the MCC paper's
-            `Correntropy` from the spanning tree of largest overlap.
+        averaging: how relative motions become poses; None for `Correntropy` from the
+            spanning tree of largest overlap.
         mask: `(v, n)` True for valid points, for a padded array only.
         order: "sequential" if each scan overlaps the next: only neighbours are
             registered to begin with, of any number of scans; not under `jit`.

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.averaging import AbstractAverager
+from jaxreg.averaging import AbstractAverager, Correntropy, SpanningTree
 from jaxreg.geometry import lie
 from jaxreg.local import (
     GaussNewton,
@@ -48,13 +48,16 @@ def refine(
     Args:
         scans: prepared scans.
         placement: poses of the centred frames, and which scans are placed.
-        averaging: see `place`.
+        averaging: None for the MCC paper's `Correntropy`.
         min_overlap: of the pairs that count.
 
     Returns:
         The placement by these pairs. Scans that are not placed keep their poses, and so
         do those that no pair holds any more.
     """
+    if averaging is None:
+        # No outliers are left: the paper's wider kernel takes more pairs in.
+        averaging = Correntropy(width="paper", initialiser=SpanningTree())
     for exact in (False, True):
         motions = _measured(scans, placement, min_overlap, exact=exact)
         again = place(motions, scans.num_scans, averaging, min_overlap)
