@@ -35,6 +35,7 @@ from jaxreg.averaging.iterate import (
 from jaxreg.averaging.laplacian import DENSE_LIMIT
 from jaxreg.averaging.plain import RowsOf, check_rows, iterate_plain, scaled_rows
 from jaxreg.averaging.scales import annealed_width, first_width, gaussian_trust
+from jaxreg.averaging.support import without_lone_closures
 from jaxreg.averaging.tree import along_frames, start
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -203,6 +204,7 @@ def _better_start(
     kernel would drop them. Plain averaging spreads the drift; with wrong edges about,
     it agrees with few, and the start stands.
     """
-    plain = iterate_plain(graph, T_start, rows, max_steps=5, tolerance=1e-2)
+    near = without_lone_closures(graph) if graph.num_poses > DENSE_LIMIT else graph
+    plain = iterate_plain(near, T_start, rows, max_steps=5, tolerance=1e-2)
     better = redundancy(graph, plain.T_world_i) > redundancy(graph, T_start)
     return jnp.where(better, plain.T_world_i, T_start)

@@ -23,6 +23,7 @@ from jaxreg.averaging.posegraph_lm import (
     robust_problem,
 )
 from jaxreg.averaging.scales import CHI2_MEDIAN
+from jaxreg.averaging.support import without_lone_closures
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.robust import Correntropy
@@ -65,6 +66,9 @@ def graduated(
     Gradients: implicit at the fixed point, widths are cut.
     """
     fixed, starts = jax.lax.stop_gradient((graph, starts))
+    # Lone closures are wrong as a rule: leaving them out is no reason to search on.
+    near = without_lone_closures(fixed)
+    believed = (fixed.weight > 0) & (near.weight == fixed.weight)
 
     def trust_of(g: PoseGraph, T: Array, state: _State) -> Array:
         now = _problem(g, state.parts, state.width)
@@ -82,7 +86,7 @@ def graduated(
             best,
             jnp.maximum(score, b.score),
             b.tried + 1,
-            _redundant_share(fixed, trust) > _SETTLED,
+            _redundant_share(believed, trust, fixed.num_poses) > _SETTLED,
         )
 
     begin = _Best(
@@ -145,12 +149,11 @@ def _narrowed(graph: PoseGraph, T_start: Array, max_steps: int) -> _State:
     return end._replace(found=found, width=end.next_width)
 
 
-def _redundant_share(graph: PoseGraph, trust: Array) -> Array:
-    """Trusted edges over all, beyond those that a tree takes."""
-    present = graph.weight > 0
-    tree = graph.num_poses - 1
-    trusted = jnp.sum(present & (trust > 0.5)) - tree
-    return trusted / jnp.maximum(jnp.sum(present) - tree, 1)
+def _redundant_share(believed: Array, trust: Array, num_poses: int) -> Array:
+    """Trusted edges over all believed ones, beyond those that a tree takes."""
+    tree = num_poses - 1
+    trusted = jnp.sum(believed & (trust > 0.5)) - tree
+    return trusted / jnp.maximum(jnp.sum(believed) - tree, 1)
 
 
 def _first_width(graph: PoseGraph, T: Array, squares: Array) -> Array:
