@@ -189,22 +189,29 @@ class Correntropy(AbstractAverager):
     def _graduated(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"], also_along_frames: bool
     ) -> Iterated:
-        starts = [_better_start(graph, T_start, scaled_rows(self.rows))]
+        # A start of the caller's may be far off: plain steps that leave out what
+        # pulls against them would bend it for good.
+        near = without_lone_closures(graph) if also_along_frames else graph
+        starts = [_better_start(graph, T_start, scaled_rows(self.rows), near)]
         if also_along_frames:
             starts.append(along_frames(graph))
         return graduated(graph, jnp.stack(starts), self.max_steps)
 
 
 def _better_start(
-    graph: PoseGraph, T_start: Float[Array, "v D D"], rows: RowsOf
+    graph: PoseGraph,
+    T_start: Float[Array, "v D D"],
+    rows: RowsOf,
+    near: PoseGraph | None = None,
 ) -> Float[Array, "v D D"]:
     """The start, or what a few plain steps make of it if more edges agree with that.
 
     A chain of good edges drifts: its loop closures then look wrong, and a redescending
     kernel would drop them. Plain averaging spreads the drift; with wrong edges about,
-    it agrees with few, and the start stands.
+    it agrees with few, and the start stands. The steps may have weights of their own,
+    those of `near`.
     """
-    near = without_lone_closures(graph) if graph.num_poses > DENSE_LIMIT else graph
-    plain = iterate_plain(near, T_start, rows, max_steps=5, tolerance=1e-2)
+    steps_on = graph if near is None else near
+    plain = iterate_plain(steps_on, T_start, rows, max_steps=5, tolerance=1e-2)
     better = redundancy(graph, plain.T_world_i) > redundancy(graph, T_start)
     return jnp.where(better, plain.T_world_i, T_start)

@@ -2,7 +2,8 @@
 
 Every edge counts by its information and by a Gaussian of its whitened error, whose
 width is halved from one that sees the right edges in spite of the drift of the start
-down to ten deviations of the edges inside it.
+down to ten deviations of the edges inside it. Closures that no other confirms count
+little until the last width, where their error alone decides.
 """
 
 from typing import NamedTuple
@@ -35,7 +36,10 @@ _DEVIATIONS, _FIRST = 10.0, 40.0
 _COARSE, _FINE = 1e-3, 1e-6
 _ROUNDS = 24
 # No other start is tried if this share of the redundant edges is trusted.
-_SETTLED = 0.95
+_SETTLED = 0.99
+# The first width of chained starts: so many times the error at this quantile of the
+# edges that do not hold, where lone closures are doubted and where none are.
+_SIFTED, _UNSIFTED = (4.0, 0.98), (2.0, 0.25)
 # Edges with more trust than this are inside.
 _INSIDE = 0.05
 
@@ -66,16 +70,18 @@ def graduated(
     Gradients: implicit at the fixed point, widths are cut.
     """
     fixed, starts = jax.lax.stop_gradient((graph, starts))
-    # Lone closures are wrong as a rule: leaving them out is no reason to search on.
+    # Lone closures are wrong as a rule: they hardly count in the wide kernels, and
+    # leaving them out is no reason to search on.
     near = without_lone_closures(fixed)
     believed = (fixed.weight > 0) & (near.weight == fixed.weight)
+    doubt = near.weight / jnp.where(fixed.weight > 0, fixed.weight, 1)
 
     def trust_of(g: PoseGraph, T: Array, state: _State) -> Array:
         now = _problem(g, state.parts, state.width)
         return now.trust(now.squares(T))
 
     def attempt(b: _Best) -> _Best:
-        end = _narrowed(fixed, starts[b.tried], max_steps)
+        end = _narrowed(fixed, doubt, starts[b.tried], max_steps)
         trust = trust_of(fixed, end.found.T, end)
         score = redundancy(fixed, end.found.T)
         steps = b.end.found.step + end.found.step
@@ -90,7 +96,7 @@ def graduated(
         )
 
     begin = _Best(
-        _before(fixed, starts[0]),
+        _before(fixed, doubt, starts[0]),
         -jnp.ones((), starts.dtype),
         jnp.asarray(0, jnp.int32),
         jnp.asarray(False),
@@ -108,26 +114,31 @@ def graduated(
     return gauss_newton_gradients(graph, result, lambda g, T, _: trust_of(g, T, end))
 
 
-def _problem(graph: PoseGraph, parts: Array, width: Array) -> Problem:
+def _problem(
+    graph: PoseGraph, parts: Array, width: Array, doubt: Array | float = 1.0
+) -> Problem:
     W = precisions(graph, jnp.ones_like(graph.weight), parts)
-    return robust_problem(graph, LOG_ERROR, W, Correntropy(), width)
+    full = robust_problem(graph, LOG_ERROR, W, Correntropy(), width)
+    return full._replace(
+        loss=lambda s: doubt * full.loss(s), trust=lambda s: doubt * full.trust(s)
+    )
 
 
-def _before(graph: PoseGraph, T_start: Array) -> _State:
+def _before(graph: PoseGraph, doubt: Array, T_start: Array) -> _State:
     """Nothing minimised yet."""
     parts = _parts(graph, T_start, jnp.ones_like(graph.weight))
     squares = _problem(graph, parts, jnp.ones_like(parts[0])).squares(T_start)
-    width = _first_width(graph, T_start, squares)
+    width = _first_width(graph, doubt == 1, T_start, squares)
     none = jnp.asarray(0, jnp.int32)
     start = Minimum(T_start, jnp.asarray(False), none)
     return _State(start, parts, jnp.full_like(width, jnp.inf), width, none)
 
 
-def _narrowed(graph: PoseGraph, T_start: Array, max_steps: int) -> _State:
+def _narrowed(graph: PoseGraph, doubt: Array, T_start: Array, max_steps: int) -> _State:
     """Minimises under narrower kernels until the edges inside fill the kernel."""
 
     def turn(s: _State) -> _State:
-        now = _problem(graph, s.parts, s.next_width)
+        now = _problem(graph, s.parts, s.next_width, doubt)
         new = minimise(now, s.found.T, max_steps, _COARSE)
         squares = now.squares(new.T)
         trust = now.trust(squares)
@@ -141,7 +152,7 @@ def _narrowed(graph: PoseGraph, T_start: Array, max_steps: int) -> _State:
     end = jax.lax.while_loop(
         lambda s: (s.next_width < 0.95 * s.width) & (s.round < _ROUNDS),
         turn,
-        _before(graph, T_start),
+        _before(graph, doubt, T_start),
     )
     last = _problem(graph, end.parts, end.next_width)
     found = minimise(last, end.found.T, max_steps, _FINE)
@@ -156,19 +167,25 @@ def _redundant_share(believed: Array, trust: Array, num_poses: int) -> Array:
     return trusted / jnp.maximum(jnp.sum(believed) - tree, 1)
 
 
-def _first_width(graph: PoseGraph, T: Array, squares: Array) -> Array:
+def _first_width(graph: PoseGraph, believed: Array, T: Array, squares: Array) -> Array:
     """A width that sees the right edges from the start.
 
     Starts that have spread their drift show the deviation by their middle edge. One
     chained along a tree leaves nothing at the edges of its tree and drift at the right
-    ones of the others: twice the lower quartile of those is wide enough.
+    ones of the others: twice the lower quartile of those is wide enough. Where lone
+    closures are doubted, nearly all others are right, and most of the drift may be at
+    a few of them.
     """
-    present, open_edges = graph.weight > 0, _open_edges(graph, T)
+    present = (graph.weight > 0) & believed
+    open_edges = _open_edges(graph, T) & believed
     chained = jnp.sum(present & ~open_edges) > 0.5 * (graph.num_poses - 1)
     middle = masked_quantile(squares, present, 0.5)
     middle = middle / CHI2_MEDIAN[lie.tangent_dim(graph.dim)]
     spread = _FIRST * jnp.sqrt(middle * _spare(graph))
-    drift = 2 * jnp.sqrt(masked_quantile(squares, open_edges, 0.25))
+    doubted = jnp.any((graph.weight > 0) & ~believed)
+    sifted, unsifted = jnp.asarray([_SIFTED, _UNSIFTED], squares.dtype)
+    times, right = jnp.where(doubted, sifted, unsifted)
+    drift = times * jnp.sqrt(masked_quantile(squares, open_edges, right))
     floor = 64 * jnp.finfo(squares.dtype).eps
     return jnp.maximum(jnp.where(chained, drift, spread), floor)
 
