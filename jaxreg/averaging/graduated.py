@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg.averaging.base import length_scale, masked_quantile
-from jaxreg.averaging.evidence import redundancy
+from jaxreg.averaging.evidence import redundancies, redundancy
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, precisions
 from jaxreg.averaging.iterate import Iterated
 from jaxreg.averaging.posegraph_lm import (
@@ -92,7 +92,8 @@ def graduated(
             best,
             jnp.maximum(score, b.score),
             b.tried + 1,
-            _redundant_share(believed, trust, fixed.num_poses) > _SETTLED,
+            (_redundant_share(believed, trust, fixed.num_poses) > _SETTLED)
+            & _tight(fixed, believed, end.found.T),
         )
 
     begin = _Best(
@@ -165,6 +166,12 @@ def _redundant_share(believed: Array, trust: Array, num_poses: int) -> Array:
     tree = num_poses - 1
     trusted = jnp.sum(believed & (trust > 0.5)) - tree
     return trusted / jnp.maximum(jnp.sum(believed) - tree, 1)
+
+
+def _tight(graph: PoseGraph, believed: Array, T_world_i: Array) -> Array:
+    """Do the edges agree at the coarsest scale, and not just under a wide kernel?"""
+    spare = jnp.sum(believed) - (graph.num_poses - 1)
+    return redundancies(graph, T_world_i)[0] > 0.5 * spare
 
 
 def _first_width(graph: PoseGraph, believed: Array, T: Array, squares: Array) -> Array:
