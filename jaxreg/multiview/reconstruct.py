@@ -1,6 +1,6 @@
 """`reconstruct`: many scans into one frame, without an initial guess.
 
-    scans -> pairs -> particle filter -> motion averaging -> joint refinement
+    scans -> pairs -> particle filter -> motion averaging -> pairs again -> averaging
 
 Every stage is one compiled function. Under `jit` the stages run as one program, with
 all pairs; called with arrays, a thin loop chooses the pairs round by round, runs two
