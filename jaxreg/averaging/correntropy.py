@@ -42,6 +42,8 @@ from jaxreg.graph.pose_graph import PoseGraph
 
 # Kernels of at most this width, radians and length scales, hold on to a start.
 _NARROW = 0.25
+# Share of the other end's agreement beyond a tree that an end must reach.
+_ENOUGH = 0.7
 
 
 class Correntropy(AbstractAverager):
@@ -157,10 +159,12 @@ class Correntropy(AbstractAverager):
             T = jnp.where(first, T_wide, T_start)
             end = self._from_width(fixed, T, jnp.where(first, width, narrow))
             score = coherence(fixed, end.T_world_i, scale)
-            best = jax.tree.map(
-                lambda new, old: jnp.where(score > s[2], new, old), end, s[1]
-            )
-            return s[0] + 1, best, jnp.maximum(score, s[2])
+            # A kernel narrower than the noise fits a tree, and little beyond.
+            spare = redundancy(fixed, end.T_world_i)
+            enough = spare > _ENOUGH * redundancy(fixed, s[1].T_world_i)
+            better = first | ((score > s[2]) & enough)
+            best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, s[1])
+            return s[0] + 1, best, jnp.where(better, score, s[2])
 
         none = Iterated(
             T_start,

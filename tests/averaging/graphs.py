@@ -97,3 +97,20 @@ def folding_graph(
     )
     X, folded = np.linalg.inv(X[0]) @ X, np.linalg.inv(folded[0]) @ folded
     return X, folded, edges, T @ error
+
+
+def noisy_grid(num: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses on a cubic grid of that many, edges to the next, and their motions.
+
+    Noise is 14 degrees and a tenth of the distance; no three edges form a cycle.
+    """
+    rng = np.random.default_rng(seed)
+    axes = np.meshgrid(*[np.arange(num)] * 3, indexing="ij")
+    place = np.stack(axes, axis=-1).reshape(-1, 3).astype(float)
+    X = motions(rotations(rng, len(place), 3, None), place)
+    apart = np.abs(place[:, None] - place).sum(axis=-1)
+    edges = np.argwhere(np.triu(apart == 1))
+    error = motions(
+        rotations(rng, len(edges), 3, 0.25), 0.1 * rng.normal(size=(len(edges), 3))
+    )
+    return X, edges, np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ error

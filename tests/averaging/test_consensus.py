@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxreg.averaging import CycleConsensus, average
+from jaxreg.averaging import CycleConsensus, PoseGraphLM, average
 from jaxreg.averaging.base import length_scale
 from jaxreg.averaging.cycles import NEUTRAL, edge_log_odds, judged
 from jaxreg.averaging.evidence import agreement, coherence
 from jaxreg.graph import PoseGraph
-from jaxreg.metrics import rotation_errors
-from tests.averaging.graphs import folding_graph, random_graph
+from jaxreg.metrics import rotation_error, rotation_errors
+from tests.averaging.graphs import folding_graph, noisy_grid, random_graph
 
 
 N, H = 16, 100
@@ -148,3 +148,15 @@ def test_settled_graphs_need_no_hypotheses():
     assert solution.num_steps > 0
     with pytest.raises(ValueError, match="hypotheses: wanted at least 1"):
         CycleConsensus(hypotheses=0)
+
+
+def test_noise_alone_is_not_taken_for_outliers():
+    for seed in range(2):
+        X, edges, T = noisy_grid(4, seed)
+        graph = PoseGraph.from_edges(edges, T.astype(np.float32))
+        found = average(graph)
+        assert np.mean(np.asarray(found.edge_weight) > 0.5) > 0.9
+        truth = X.astype(np.float32)
+        error = rotation_error(found.T_world_i, truth, "best")
+        least_squares = average(graph, PoseGraphLM()).T_world_i
+        assert error < 1.2 * rotation_error(least_squares, truth, "best")
