@@ -156,7 +156,7 @@ def test_noise_alone_is_not_taken_for_outliers():
         graph = PoseGraph.from_edges(edges, T.astype(np.float32))
         found = average(graph)
         assert np.mean(np.asarray(found.edge_weight) > 0.5) > 0.9
-        truth = X.astype(np.float32)
+        truth = jnp.asarray(X, jnp.float32)
         error = rotation_error(found.T_world_i, truth, "best")
         least_squares = average(graph, PoseGraphLM()).T_world_i
         assert error < 1.2 * rotation_error(least_squares, truth, "best")
