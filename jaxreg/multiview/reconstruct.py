@@ -40,8 +40,8 @@ def reconstruct(
     method: ParticleFilter | None = None,
     averaging: AbstractAverager | None = None,
     mask: object = None,
-    order: Order = "any",
-    previous: ReconstructionSolution | RelativeMotions | None = None,
+    order: Order | str = "any",
+    previous: object = None,
     progress: Progress | None = None,
     on_pairs: OnPairs | None = None,
 ) -> ReconstructionSolution:
@@ -60,9 +60,9 @@ def reconstruct(
         mask: `(v, n)` True for valid points, for a padded array only.
         order: "sequential" if each scan overlaps the next: only neighbours are
             registered to begin with, of any number of scans; not under `jit`.
-        previous: a solution for the first of these scans, whose pairs are not
-            registered again; or the motions that `on_pairs` got in a run that was
-            interrupted, which leads to the same answer. Not under `jit`.
+        previous: a `ReconstructionSolution` of the first of these scans, whose pairs
+            are not registered again; or the `RelativeMotions` that `on_pairs` got in a
+            run that was interrupted, which leads to the same answer. Not under `jit`.
         progress: called as `progress(stage, done, total)`; not under `jit`.
         on_pairs: called with the `RelativeMotions` of every few pairs as they are
             found, in the input's frames and unit; not under `jit`.
@@ -89,8 +89,7 @@ def reconstruct(
             f"method: wanted a ParticleFilter, found {type(method).__name__}."
         )
     key = check_key(key)
-    if order not in ("any", "sequential"):
-        raise ValueError(f"order: wanted 'any' or 'sequential', found {order!r}.")
+    order = _checked(order)
     if not (is_concrete(points) and is_concrete(key)):
         if order != "any" or not (previous is None and on_pairs is None):
             raise ValueError(
@@ -116,7 +115,7 @@ def reconstruct(
 
 
 def _known(
-    previous: ReconstructionSolution | RelativeMotions | None,
+    previous: object,
     scans: PreparedScans,
     order: Order,
 ) -> tuple[RelativeMotions | None, np.ndarray | None]:
@@ -126,8 +125,8 @@ def _known(
     """
     if previous is None:
         return None, None
-    earlier = isinstance(previous, ReconstructionSolution)
-    motions = previous.motions if earlier else previous
+    earlier = previous if isinstance(previous, ReconstructionSolution) else None
+    motions = previous if earlier is None else earlier.motions
     if not isinstance(motions, RelativeMotions):
         raise TypeError(
             "previous: wanted a ReconstructionSolution or RelativeMotions, found "
@@ -135,18 +134,26 @@ def _known(
         )
     if motions.T_i_j.shape[-1] != scans.mean.shape[-1] + 1:
         raise ValueError("previous: of another dimension than the scans.")
-    num_old = previous.num_scans if earlier else 1 + int(np.max(motions.pairs))
+    num_old = (
+        earlier.num_scans if earlier is not None else 1 + int(np.max(motions.pairs))
+    )
     if num_old > scans.num_scans:
         raise ValueError(
             f"previous: of {num_old} scans, but there are {scans.num_scans}."
         )
     first = None
-    if earlier:
+    if earlier is not None:
         rng = np.random.default_rng(num_old)
         new = first_pairs(scans.num_scans, order, rng)
         first = np.concatenate([motions.pairs, new[new[:, 1] >= num_old]])
         first = np.unique(first, axis=0)
     return motions.in_centred_frames(scans), first
+
+
+def _checked(order: str) -> Order:
+    if order == "any" or order == "sequential":
+        return order
+    raise ValueError(f"order: wanted 'any' or 'sequential', found {order!r}.")
 
 
 def _silent(stage: str, done: int, total: int) -> None:
