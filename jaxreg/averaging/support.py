@@ -51,10 +51,7 @@ def confirmed(graph: PoseGraph, closure: Bool[Array, " e"]) -> Bool[Array, " e"]
     supported = jnp.zeros((graph.num_edges,), bool)
     for step in range(1, _COMPARED + 1):
         k, m = jnp.roll(low, -step), jnp.roll(high, -step)
-        expected = product(
-            lie.inverse(T_world_i)[k],
-            product(gap, T_world_i[m]),
-        )
+        expected = product(lie.inverse(T_world_i)[k], product(gap, T_world_i[m]))
         error = product(lie.inverse(jnp.roll(T_low_high, -step, axis=0)), expected)
         near = (jnp.roll(cell, -step) == cell) & (jnp.abs(m - high) < _NEAR)
         agree = near & closure[order] & (_size(error, scale) < _AGREES**2)

@@ -20,6 +20,8 @@ from jaxreg.io.result import Result, version
 from jaxreg.io.stanford import read_conf
 
 
+Order = Literal["any", "sequential"]
+
 FILES = (
     "result.json",
     "poses.tum",
@@ -40,7 +42,7 @@ class Multiview(Options):
     """Files (PLY, XYZ, PCD, LAS, ...), a folder of these, or an archive (NPZ, E57)."""
     truth: Path | None = None
     """Pose file of the Stanford repository (.conf, metres): adds a table of errors."""
-    order: Literal["any", "sequential"] = "any"
+    order: Order = "any"
     """Of the scans; sequential if each overlaps the next: fewer pairs are tried."""
     resume: bool = False
     """Go on with the pairs that an interrupted run left in the output folder."""
@@ -63,7 +65,7 @@ class Multiview(Options):
             if not len(log):
                 raise
             raise KeyboardInterrupt(
-                f"{len(log)} pairs are kept in {log.path}; "
+                f"pairs kept in {log.path}: {len(log)}; "
                 "the same command with --resume goes on from there"
             ) from err
         require_two_placed(result, scans)
@@ -88,7 +90,7 @@ def reconstruct_scans(
     scans: Scans,
     key: Any,
     progress: Progress,
-    order: Literal["any", "sequential"] = "any",
+    order: Order = "any",
     log: PairLog | None = None,
 ) -> Result:
     """Reconstructs centred scans and moves the answer to the frames of the files.

@@ -387,7 +387,7 @@ def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
     monkeypatch.setattr(jaxreg, "reconstruct", stopped)
     assert main(["multiview", *scans]) == 130
     message = capsys.readouterr().err
-    assert "1 pairs are kept" in message
+    assert "pairs.jsonl: 1;" in message
     assert "--resume" in message
     kept = folder / "jaxreg-out" / "pairs.jsonl"
     assert kept.exists()
