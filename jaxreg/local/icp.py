@@ -24,7 +24,7 @@ from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.problem import Match, Problem, match
 from jaxreg.local.residuals import AbstractResidual, PlaneToPlane
 from jaxreg.local.scale import fit_scale
-from jaxreg.local.score import mutual_overlap, score, score_match
+from jaxreg.local.score import Score, mutual_overlap, score, score_match
 from jaxreg.local.steps import AbstractStep, GaussNewton, GradientDescent
 from jaxreg.neighbours import AbstractIndex, BruteForce, index_within
 from jaxreg.robust import AbstractKernel, GemanMcClure
@@ -151,7 +151,7 @@ class ICP(AbstractRegistrar):
             fitness=there.fitness,
             inlier_rmse=there.inlier_rmse,
             num_inliers=there.num_inliers,
-            overlap=mutual_overlap(there.fitness, back),
+            overlap=mutual_overlap(there, back),
             num_steps=end.num_steps,
             H=curvature.H,
             b=curvature.b,
@@ -228,8 +228,8 @@ class ICP(AbstractRegistrar):
         T: Motion,
         scale: Scalar,
         spacing: Scalar,
-    ) -> Float[Array, ""]:
-        """The share of the target that lies on the source."""
+    ) -> Score:
+        """Of the target on the source."""
         # Few queries, far apart: comparing all pairs is quicker than building a tree.
         points = lax.stop_gradient(scale) * source.points
         source = PointCloud(points, source.normals, source.mask)
@@ -238,4 +238,4 @@ class ICP(AbstractRegistrar):
         rows, use = spread_rows(target.mask, _SCORED_POINTS)
         some = problem.of_rows(rows)
         some = eqx.tree_at(lambda p: p.source_mask, some, use)
-        return score(some, lie.inverse(T), spacing).fitness
+        return score(some, lie.inverse(T), spacing)

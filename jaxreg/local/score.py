@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import on_both
 from jaxreg._core.typing import Motion
@@ -18,14 +18,33 @@ from jaxreg.neighbours.base import AbstractIndex
 _REACH = 1.0
 _PLANE = 0.2
 _COSINE_SQ = 0.75
+# It contradicts that surface if it is beside a sample, no more than so far along the
+# surface, but clearly over or under its plane, with normals within 45 degrees.
+_OVER, _FAR_OVER = 0.35, 3.0
+_ALIKE_SQ = 0.5
 
 
 class Score(eqx.Module):
-    """Agreement of one cloud with another: share on it and residual of that share."""
+    """Agreement of one cloud with another.
 
-    fitness: Float[Array, ""]
-    inlier_rmse: Float[Array, ""]
-    num_inliers: Int[Array, ""]
+    Attributes:
+        fitness: share of the cloud that lies on the other.
+        inlier_rmse: residual of that share.
+        num_inliers: int32, points in that share.
+        num_conflicts: int32, points over or under the other surface.
+    """
+
+    fitness: Float[Array, "*q"]
+    inlier_rmse: Float[Array, "*q"]
+    num_inliers: Int[Array, "*q"]
+    num_conflicts: Int[Array, "*q"]
+
+    @property
+    def consistency(self) -> Float[Array, "*q"]:
+        """Share of the inliers among the points that agree or conflict."""
+        agree = self.num_inliers.astype(self.fitness.dtype)
+        either = self.num_inliers + self.num_conflicts
+        return agree / jnp.maximum(either, 1)
 
 
 def score(
@@ -41,34 +60,56 @@ def score(
     return score_match(match(problem, T_target_source), spacing)
 
 
-def score_match(found: Match, spacing: Float[Array, ""]) -> Score:
-    """`score` of correspondences that are known already."""
-    plane = found.plane_residual
-    flat = jnp.any(found.normal != 0, axis=0)
-    height = jnp.where(flat, plane**2, found.sq_residual)
-    inlier = (
+def agreeing(found: Match, spacing: Float[Array, ""]) -> Bool[Array, " n"]:
+    """Which points lie on the other surface."""
+    height, _ = _height_sq(found)
+    return (
         (found.sq_residual < (_REACH * spacing) ** 2)
         & (height < (_PLANE * spacing) ** 2)
         & (found.agreement > _COSINE_SQ)
         & found.mask
     )
+
+
+def _height_sq(found: Match) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+    """Squared distances to the matched planes, or points, and where planes are."""
+    flat = jnp.any(found.normal != 0, axis=0)
+    return jnp.where(flat, found.plane_residual**2, found.sq_residual), flat
+
+
+def score_match(found: Match, spacing: Float[Array, ""]) -> Score:
+    """`score` of correspondences that are known already."""
+    height, flat = _height_sq(found)
+    inlier = agreeing(found, spacing)
+    conflict = (
+        (found.sq_residual - height < (_REACH * spacing) ** 2)
+        & (height > (_OVER * spacing) ** 2)
+        & (height < (_FAR_OVER * spacing) ** 2)
+        & (found.agreement > _ALIKE_SQ)
+        & (found.mask & flat)
+    )
     count = jnp.sum(inlier)
     total = jnp.maximum(jnp.sum(found.mask), 1)
     sq = jnp.sum(jnp.where(inlier, height, 0)) / jnp.maximum(count, 1)
     fitness = (count / total).astype(sq.dtype)
-    return Score(fitness, jnp.sqrt(sq), count.astype(jnp.int32))
+    num_conflicts = jnp.sum(conflict).astype(jnp.int32)
+    return Score(fitness, jnp.sqrt(sq), count.astype(jnp.int32), num_conflicts)
 
 
-def mutual_overlap(
-    there: Float[Array, "*q"], back: Float[Array, "*q"]
-) -> Float[Array, "*q"]:
-    """How much two clouds share, of the shares of either that lie on the other.
+def mutual_overlap(there: Score, back: Score) -> Float[Array, "*q"]:
+    """How much two clouds share, by the scores of either on the other.
 
-    Their geometric mean: between real scans it tells right poses from wrong ones better
-    than the lesser of the two. But at most twice the lesser, as nearly everything fits
-    a small patch of a smooth surface.
+    The geometric mean of the shares that lie on the other: between real scans it tells
+    right poses from wrong ones better than the lesser of the two. But at most twice the
+    lesser, as nearly everything fits a small patch of a smooth surface. Times the
+    consistencies: where two scans show the same place they show it at the same height,
+    while surfaces that touch by chance part again. (Scans of an object have a
+    consistency of 0.95 and more, of a cluttered room 0.8; smooth surfaces laid on each
+    other wrongly 0.3 to 0.7.)
     """
-    return jnp.minimum(jnp.sqrt(there * back), 2 * jnp.minimum(there, back))
+    least = jnp.minimum(there.fitness, back.fitness)
+    share = jnp.minimum(jnp.sqrt(there.fitness * back.fitness), 2 * least)
+    return share * there.consistency * back.consistency
 
 
 def score_both_ways(

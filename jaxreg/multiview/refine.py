@@ -96,8 +96,8 @@ def _measured(
     def one(pair: Array) -> tuple[Motion, Scalar]:
         i, j = pair
         T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
-        there = score(_problem(scans, i, j), T_i_j, spacing).fitness
-        back = score(_problem(scans, j, i), lie.inverse(T_i_j), spacing).fitness
+        there = score(_problem(scans, i, j), T_i_j, spacing)
+        back = score(_problem(scans, j, i), lie.inverse(T_i_j), spacing)
         overlap = jnp.where(_both(placed, pair), mutual_overlap(there, back), 0)
         T_i_j = lax.cond(overlap >= min_overlap, measured, lambda _: T_i_j, pair)
         return T_i_j, overlap

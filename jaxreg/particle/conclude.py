@@ -24,6 +24,7 @@ from jaxreg.local import (
     Problem,
     RegistrationSolution,
     Score,
+    can_slip,
     match,
     mutual_overlap,
     score_both_ways,
@@ -76,7 +77,7 @@ class Pair(eqx.Module):
         there, back = score_both_ways(
             self.source, self.target, self.source_index, self.target_index, T, spacing
         )
-        return there, mutual_overlap(there.fitness, back.fitness)
+        return there, mutual_overlap(there, back)
 
 
 def conclude(
@@ -131,8 +132,9 @@ def conclude(
     rival = (overlap[1:] > _RIVAL_OVERLAP * overlap[0]) | (
         weight[1:] > _RIVAL_WEIGHT * weight[0]
     )
+    doubtful = jnp.any(rival) | can_slip(pair.problem, T_modes[0], spacing)
     status = _status(
-        overlap[0], jnp.any(rival), pair, min_overlap, finished | (refine_steps > 0)
+        overlap[0], doubtful, pair, min_overlap, finished | (refine_steps > 0)
     )
     return RegistrationSolution(
         T_target_source=T_modes[0],
@@ -232,14 +234,14 @@ def _of_used(
 
 def _status(
     overlap: Float[Array, ""],
-    rivalled: Bool[Array, ""],
+    doubtful: Bool[Array, ""],
     pair: Pair,
     min_overlap: Array | float,
     finished: Bool[Array, ""],
 ) -> Int[Array, ""]:
     """Of the answer; an overlap of -1 marks one that is no mode."""
     status = jnp.where(finished, Status.CONVERGED, Status.MAX_STEPS)
-    status = jnp.where(rivalled, Status.AMBIGUOUS, status)
+    status = jnp.where(doubtful, Status.AMBIGUOUS, status)
     status = jnp.where(overlap < min_overlap, Status.LOW_OVERLAP, status)
     status = jnp.where(overlap < 0, Status.NON_FINITE, status)
     d = pair.source.points.shape[1]

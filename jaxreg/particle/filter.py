@@ -126,7 +126,7 @@ class ParticleFilter(AbstractSearch):
     width_start: Array | float = traced(0.3)
     width_end: Array | float = traced(0.06)
     tolerance: Array | float = traced(1e-4)
-    min_overlap: Array | float = traced(0.14)
+    min_overlap: Array | float = traced(0.1)
 
     def __check_init__(self) -> None:
         """Refuses counts that leave nothing to do."""
