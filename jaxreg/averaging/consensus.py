@@ -22,7 +22,6 @@ from jaxreg.averaging.evidence import (
 )
 from jaxreg.averaging.laplacian import DENSE_LIMIT
 from jaxreg.averaging.moves import frames_moved, groups_moved, settled
-from jaxreg.averaging.support import without_lone_closures
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -176,7 +175,6 @@ def _shortest(graph: PoseGraph, odds: Array) -> Array:
 
 
 def _without_cycles(graph: PoseGraph) -> Array:
-    graph = without_lone_closures(graph)
     heaviest, scale = _heaviest(graph), length_scale(graph)
     paths = trees.shortest_path_poses(
         graph.edges, graph.T_i_j, graph.weight, graph.num_poses

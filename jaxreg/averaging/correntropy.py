@@ -98,13 +98,12 @@ class Correntropy(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Averages a prepared graph."""
-        T_start = start(self.initialiser, graph, init, key)
-        if self.width == "paper":
-            end = self._paper(graph, T_start)
-        elif graph.num_poses <= DENSE_LIMIT:
-            end = self._annealed(graph, T_start, init is None)
+        if self.width == "annealed" and graph.num_poses > DENSE_LIMIT:
+            end = self._graduated(graph, init, key)
         else:
-            end = self._graduated(graph, T_start, init is None)
+            T_start = start(self.initialiser, graph, init, key)
+            narrow = self._annealed if self.width == "annealed" else self._paper
+            end = narrow(graph, T_start, init is None)
         return solution(
             graph,
             end.T_world_i,
@@ -114,7 +113,9 @@ class Correntropy(AbstractAverager):
             num_steps=end.num_steps,
         )
 
-    def _paper(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
+    def _paper(
+        self, graph: PoseGraph, T_start: Float[Array, "v D D"], _: bool
+    ) -> Iterated:
         scale = length_scale(graph)
         root_two = jnp.sqrt(jnp.asarray(2, scale.dtype))
 
@@ -143,7 +144,7 @@ class Correntropy(AbstractAverager):
         """Ends from a wide kernel or, where more coherent, from a narrow one."""
         fixed, T_start = jax.lax.stop_gradient((graph, T_start))
         scale = length_scale(fixed)
-        T_wide = _better_start(fixed, T_start, scaled_rows(self.rows))
+        T_wide = _better_start(fixed, T_start, scaled_rows(self.rows), fixed)
         width = first_width(fixed, T_wide)
         if not compare:
             end = self._from_width(fixed, T_wide, width)
@@ -191,31 +192,32 @@ class Correntropy(AbstractAverager):
         )
 
     def _graduated(
-        self, graph: PoseGraph, T_start: Float[Array, "v D D"], also_along_frames: bool
+        self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
     ) -> Iterated:
-        # A start of the caller's may be far off: plain steps that leave out what
-        # pulls against them would bend it for good.
-        near = without_lone_closures(graph) if also_along_frames else graph
-        starts = [_better_start(graph, T_start, scaled_rows(self.rows), near)]
-        if also_along_frames:
-            starts.append(along_frames(graph))
-        return graduated(graph, jnp.stack(starts), self.max_steps)
+        near = without_lone_closures(jax.lax.stop_gradient(graph))
+        rows = scaled_rows(self.rows)
+        if init is None:
+            T_start = start(self.initialiser, near, None, key)
+            starts = [_better_start(graph, T_start, rows, near), along_frames(graph)]
+        else:
+            # A start of the caller's may be far off: plain steps that leave out what
+            # pulls against them would bend it for good.
+            starts = [_better_start(graph, init, rows, graph)]
+        return graduated(graph, near, jnp.stack(starts), self.max_steps)
 
 
 def _better_start(
     graph: PoseGraph,
     T_start: Float[Array, "v D D"],
     rows: RowsOf,
-    near: PoseGraph | None = None,
+    near: PoseGraph,
 ) -> Float[Array, "v D D"]:
     """The start, or what a few plain steps make of it if more edges agree with that.
 
     A chain of good edges drifts: its loop closures then look wrong, and a redescending
     kernel would drop them. Plain averaging spreads the drift; with wrong edges about,
-    it agrees with few, and the start stands. The steps may have weights of their own,
-    those of `near`.
+    it agrees with few, and the start stands. The steps have the weights of `near`.
     """
-    steps_on = graph if near is None else near
-    plain = iterate_plain(steps_on, T_start, rows, max_steps=5, tolerance=1e-2)
+    plain = iterate_plain(near, T_start, rows, max_steps=5, tolerance=1e-2)
     better = redundancy(graph, plain.T_world_i) > redundancy(graph, T_start)
     return jnp.where(better, plain.T_world_i, T_start)

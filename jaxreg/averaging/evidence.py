@@ -93,6 +93,9 @@ def coherence(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     sq = squared_errors(graph, T_world_i, scale)
     count = votes(graph)
     agreed = agrees(sq)
+    if graph.num_edges <= _NEIGHBOURS * graph.num_poses:
+        # Nearly all neighbours are among the nearest: they say nothing else.
+        return weighted_mean(agreed, count)
     i, j, num = graph.edges[:, 0], graph.edges[:, 1], graph.num_poses
     gap = product(lie.inverse(T_world_i)[i], T_world_i[j])
     near = graph.dim - jnp.trace(lie.rotation(gap), axis1=-2, axis2=-1)

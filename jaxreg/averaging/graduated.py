@@ -21,10 +21,10 @@ from jaxreg.averaging.posegraph_lm import (
     Minimum,
     Problem,
     minimise,
+    no_cycle,
     robust_problem,
 )
 from jaxreg.averaging.scales import CHI2_MEDIAN
-from jaxreg.averaging.support import without_lone_closures
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.robust import Correntropy
@@ -35,6 +35,8 @@ from jaxreg.robust import Correntropy
 _DEVIATIONS, _FIRST = 10.0, 40.0
 _COARSE, _FINE = 1e-3, 1e-6
 _ROUNDS = 24
+# The next width is the last one where it is no narrower than this share.
+_SAME = 0.9
 # No other start is tried if this share of the redundant edges is trusted.
 _SETTLED = 0.99
 # The first width of chained starts: so many times the error at this quantile of the
@@ -50,6 +52,7 @@ class _State(NamedTuple):
     width: Array  # of this minimisation
     next_width: Array
     round: Array
+    done: Array
 
 
 class _Best(NamedTuple):
@@ -60,19 +63,21 @@ class _Best(NamedTuple):
 
 
 def graduated(
-    graph: PoseGraph, starts: Float[Array, "s v D D"], max_steps: int
+    graph: PoseGraph,
+    near: PoseGraph,
+    starts: Float[Array, "s v D D"],
+    max_steps: int,
 ) -> Iterated:
     """The best of the ends from several starts, tried until one leaves few edges out.
 
     Each start takes rounds of minimisation, at most `max_steps` steps each, under
-    narrower and narrower kernels.
+    narrower and narrower kernels. `near` is the graph `without_lone_closures`: those
+    are wrong as a rule, so they do not count in the wide kernels, and leaving them out
+    is no reason to search on.
 
     Gradients: implicit at the fixed point, widths are cut.
     """
-    fixed, starts = jax.lax.stop_gradient((graph, starts))
-    # Lone closures are wrong as a rule: they hardly count in the wide kernels, and
-    # leaving them out is no reason to search on.
-    near = without_lone_closures(fixed)
+    fixed, near, starts = jax.lax.stop_gradient((graph, near, starts))
     believed = (fixed.weight > 0) & (near.weight == fixed.weight)
     doubt = near.weight / jnp.where(fixed.weight > 0, fixed.weight, 1)
 
@@ -131,34 +136,34 @@ def _before(graph: PoseGraph, doubt: Array, T_start: Array) -> _State:
     squares = _problem(graph, parts, jnp.ones_like(parts[0])).squares(T_start)
     width = _first_width(graph, doubt == 1, T_start, squares)
     none = jnp.asarray(0, jnp.int32)
-    start = Minimum(T_start, jnp.asarray(False), none)
-    return _State(start, parts, jnp.full_like(width, jnp.inf), width, none)
+    cycle = no_cycle(_problem(graph, parts, width), T_start)
+    start = Minimum(T_start, jnp.asarray(False), none, cycle)
+    unlimited = jnp.full_like(width, jnp.inf)
+    return _State(start, parts, unlimited, width, none, jnp.asarray(False))
 
 
 def _narrowed(graph: PoseGraph, doubt: Array, T_start: Array, max_steps: int) -> _State:
-    """Minimises under narrower kernels until the edges inside fill the kernel."""
+    """Minimises under narrower kernels until the edges inside fill the kernel.
+
+    Then once more with all edges, to the end.
+    """
 
     def turn(s: _State) -> _State:
-        now = _problem(graph, s.parts, s.next_width, doubt)
-        new = minimise(now, s.found.T, max_steps, _COARSE)
+        last = (s.next_width > _SAME * s.width) | (s.round == _ROUNDS)
+        now = _problem(graph, s.parts, s.next_width, jnp.where(last, 1, doubt))
+        least = jnp.where(last, _FINE, _COARSE)
+        new = minimise(now, s.found.T, max_steps, least, s.found.cycle)
         squares = now.squares(new.T)
         trust = now.trust(squares)
         deviation = _inside_deviation(graph, squares, trust, s.next_width)
         width = jnp.clip(_DEVIATIONS * deviation, 0.5 * s.next_width, s.next_width)
         width = jnp.maximum(width, 64 * jnp.finfo(width.dtype).eps)
         new = new._replace(step=s.found.step + new.step)
-        parts = _parts(graph, new.T, trust)
-        return _State(new, parts, s.next_width, width, s.round + 1)
+        parts = jnp.where(last, s.parts, _parts(graph, new.T, trust))
+        return _State(new, parts, s.next_width, width, s.round + 1, last)
 
-    end = jax.lax.while_loop(
-        lambda s: (s.next_width < 0.95 * s.width) & (s.round < _ROUNDS),
-        turn,
-        _before(graph, doubt, T_start),
-    )
-    last = _problem(graph, end.parts, end.next_width)
-    found = minimise(last, end.found.T, max_steps, _FINE)
-    found = found._replace(step=end.found.step + found.step)
-    return end._replace(found=found, width=end.next_width)
+    start = _before(graph, doubt, T_start)
+    return jax.lax.while_loop(lambda s: ~s.done, turn, start)
 
 
 def _redundant_share(believed: Array, trust: Array, num_poses: int) -> Array:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.averaging.base import length_scale
 from jaxreg.averaging.implicit import differentiable
-from jaxreg.averaging.laplacian import divergence, solve_flow
+from jaxreg.averaging.laplacian import divergence, flow_solver
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 
@@ -57,13 +57,25 @@ def averaging_step(rows_of: RowsOf) -> Step:
     """
 
     def step(graph: PoseGraph, T: Array, trust: Array, width: Array) -> Array:
-        flow = lie.log(graph.residual_motions(T))
-        weight = rows_of(graph, trust)
-        # Each step takes up what the last one left.
-        tangent = solve_flow(graph.edges, weight, flow, graph.num_poses, 1e-4)
-        return nearby_rotation(product(lie.exp(tangent), T))
+        return averaged(graph, T, step_solver(graph, rows_of(graph, trust)))
 
     return step
+
+
+def step_solver(
+    graph: PoseGraph, weight: Float[Array, " e"]
+) -> Callable[[Float[Array, "e k"]], Float[Array, "v k"]]:
+    """The tangents of a step from the logarithms of residual motions."""
+    # Each step takes up what the last one left.
+    return flow_solver(graph.edges, weight, graph.num_poses, 1e-4)
+
+
+def averaged(
+    graph: PoseGraph, T: Float[Array, "v D D"], solve: Callable[[Array], Array]
+) -> Float[Array, "v D D"]:
+    """The poses after one step of motion averaging, by `step_solver`."""
+    tangent = solve(lie.log(graph.residual_motions(T)))
+    return nearby_rotation(product(lie.exp(tangent), T))
 
 
 def averaging_gradients(

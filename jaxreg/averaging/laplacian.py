@@ -8,11 +8,13 @@ Up to `DENSE_LIMIT` frames the matrix is formed; above, conjugate gradients work
 edges, preconditioned by a multigrid cycle. Any numbering of frames is right.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxreg.averaging.krylov import conjugate_gradients
-from jaxreg.averaging.multigrid import anchored, multigrid
+from jaxreg.averaging.multigrid import Laplacian, Multigrid, anchored, multigrid
 
 
 #: Largest number of frames for which a dense matrix over frames is formed.
@@ -39,11 +41,21 @@ def solve_flow(
     Frames that no weight holds stay at 0 (the solution of least norm). Graphs above
     `DENSE_LIMIT` are solved to a relative `tolerance`, at best that of the dtype.
     """
+    return flow_solver(edges, weight, num_poses, tolerance)(flow)
+
+
+def flow_solver(
+    edges: Int[Array, "e 2"],
+    weight: Float[Array, " e"],
+    num_poses: int,
+    tolerance: float = 0.0,
+) -> Callable[[Float[Array, "e k"]], Float[Array, "v k"]]:
+    """`solve_flow` for many flows under the same weights, prepared once."""
     # The weights are relative: no power of them can underflow the whole system.
     top = jnp.max(weight)
     w = weight / jnp.where(top > 0, top, 1)
-    rhs = divergence(edges, w[:, None] * flow, num_poses)
-    return solve_laplacian(edges, w, rhs, tolerance)
+    solve = _solver(edges, w, num_poses, tolerance)
+    return lambda flow: solve(divergence(edges, w[:, None] * flow, num_poses))
 
 
 def solve_laplacian(
@@ -53,10 +65,18 @@ def solve_laplacian(
     tolerance: float = 0.0,
 ) -> Float[Array, "v k"]:
     """The x with x_0 = 0 and B' W B x = rhs but for row 0; weights of at most 1."""
-    rhs = rhs.at[0].set(0)
-    if rhs.shape[0] <= DENSE_LIMIT:
-        return jnp.linalg.lstsq(laplacian(edges, weight, rhs.shape[0]), rhs)[0]
-    return _conjugate_gradients(edges, weight, rhs, tolerance)
+    return _solver(edges, weight, rhs.shape[0], tolerance)(rhs)
+
+
+def _solver(
+    edges: Array, weight: Array, num_poses: int, tolerance: float
+) -> Callable[[Array], Array]:
+    if num_poses <= DENSE_LIMIT:
+        L = laplacian(edges, weight, num_poses)
+        return lambda rhs: jnp.linalg.lstsq(L, rhs.at[0].set(0))[0]
+    matrix = anchored(edges, weight[:, None, None], num_poses)
+    inverse = multigrid(matrix)
+    return lambda rhs: _conjugate_gradients(matrix, inverse, rhs, tolerance)
 
 
 def laplacian(
@@ -71,15 +91,14 @@ def laplacian(
 
 
 def _conjugate_gradients(
-    edges: Array, weight: Array, rhs: Array, tolerance: float
+    matrix: Laplacian, inverse: Multigrid, rhs: Array, tolerance: float
 ) -> Array:
     """Preconditioned conjugate gradients, the k columns side by side."""
-    matrix = anchored(edges, weight[:, None, None], rhs.shape[0])
     # What arrives at frame 0 leaves the others.
-    rhs = rhs.at[0].set(-jnp.sum(rhs, axis=0))
+    rhs = rhs.at[0].set(-jnp.sum(rhs[1:], axis=0))
     x = conjugate_gradients(
         matrix,
-        multigrid(matrix),
+        inverse,
         rhs[:, None, :],
         tolerance=max(tolerance, 3 * float(jnp.finfo(rhs.dtype).eps)),
         max_steps=500,

@@ -7,6 +7,7 @@ equations as in the MCC paper, 14-21.
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -16,9 +17,10 @@ from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
 from jaxreg.averaging.iterate import (
     Iterated,
     RowsOf,
+    averaged,
     averaging_gradients,
-    averaging_step,
     iterate,
+    step_solver,
 )
 from jaxreg.averaging.tree import SpanningTree, start
 from jaxreg.graph.pose_graph import PoseGraph
@@ -130,6 +132,8 @@ def iterate_plain(
     tolerance: Array | float,
 ) -> Iterated:
     """Averaging in which every edge is trusted; no gradients."""
+    graph = jax.lax.stop_gradient(graph)
+    solve = step_solver(graph, rows(graph, jnp.ones_like(graph.weight)))
 
     def same_width(g: PoseGraph, T: Array, width: Array) -> Array:
         return width
@@ -140,7 +144,7 @@ def iterate_plain(
         jnp.full((2,), jnp.inf, T_start.dtype),
         same_width,
         _full_trust,
-        averaging_step(rows),
+        lambda g, T, trust, width: averaged(g, T, solve),
         max_steps=max_steps,
         tolerance=tolerance,
     )

@@ -20,7 +20,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
+from jaxreg.averaging.base import (
+    AbstractAverager,
+    AveragingSolution,
+    length_scale,
+    solution,
+)
 from jaxreg.averaging.block_system import solve_block_flow
 from jaxreg.averaging.iterate import nearby_rotation
 from jaxreg.averaging.multigrid import Multigrid, anchored, matmul, multigrid
@@ -31,8 +36,10 @@ from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
 from jaxreg.robust import AbstractKernel
 
 
-# A preconditioner is built anew at so many times the rounds of its first use.
-_STALE = 2
+# A preconditioner is built anew at so many times the rounds of its first use, and when
+# a pose has moved by this share of the length of an edge: how turns of one end shift
+# the other depends on where they are, and on it how stiff bends of long chains are.
+_STALE, _MOVED = 2, 0.3
 # Share of a step's gain that conjugate gradients may leave to the next.
 _UNDONE = 0.1
 # Damping after the first refused step, and the least. There is none before: even 1e-9
@@ -176,6 +183,25 @@ class Minimum(NamedTuple):
     T: Float[Array, "v D D"]
     converged: Bool[Array, ""]
     step: Int[Array, ""]
+    cycle: "Cycle"
+
+
+class Cycle(NamedTuple):
+    """A multigrid cycle kept from step to step as long as it serves."""
+
+    inverse: Multigrid  # of the normal equations at this or an earlier step
+    usual: Int[Array, ""]  # rounds that it first took, 0 where it is to be built
+    moved: Float[Array, ""]  # how far poses have moved since, at most
+
+
+def no_cycle(problem: "Problem", T: Float[Array, "v D D"]) -> Cycle:
+    """One to be built."""
+    graph = problem.graph
+    shapes = jax.eval_shape(
+        lambda: multigrid(anchored(graph.edges, problem.normal(T)[0], graph.num_poses))
+    )
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return Cycle(blank, jnp.asarray(0, jnp.int32), jnp.zeros((), T.dtype))
 
 
 def minimise(
@@ -183,22 +209,21 @@ def minimise(
     T_start: Float[Array, "v D D"],
     max_steps: int,
     tolerance: Array | float,
+    cycle: Cycle | None = None,
 ) -> Minimum:
-    """Steps until the next would lower the objective by less than `tolerance` of it."""
-    graph, cost = problem.graph, problem.cost(T_start)
+    """Steps until the next would lower the objective by less than `tolerance` of it.
+
+    `cycle` may be that of a similar problem.
+    """
+    cost = problem.cost(T_start)
     limit = jnp.maximum(tolerance, 4 * jnp.finfo(cost.dtype).eps)
     zero, inf = jnp.zeros_like(cost), jnp.full_like(cost, jnp.inf)
-    inverse = jax.eval_shape(
-        lambda: multigrid(
-            anchored(graph.edges, problem.normal(T_start)[0], graph.num_poses, zero)
-        )
-    )
     begin = _State(
         T=T_start,
         cost=cost,
         damping=zero,
-        inverse=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), inverse),
-        usual=jnp.asarray(0, jnp.int32),
+        cycle=no_cycle(problem, T_start) if cycle is None else cycle,
+        length=length_scale(problem.graph),
         gain=inf,
         next_gain=inf,
         step=jnp.asarray(0, jnp.int32),
@@ -208,15 +233,15 @@ def minimise(
         lambda s: _try_step(problem, s),
         begin,
     )
-    return Minimum(end.T, end.next_gain <= limit, end.step)
+    return Minimum(end.T, end.next_gain <= limit, end.step, end.cycle)
 
 
 class _State(NamedTuple):
     T: Array
     cost: Array
     damping: Array
-    inverse: Multigrid  # of the normal equations at this or an earlier step
-    usual: Array  # rounds that it first took, 0 where it is to be built
+    cycle: Cycle
+    length: Array  # of a usual edge
     gain: Array  # share of the cost that the last step took away
     next_gain: Array  # what the next one is expected to
     step: Array
@@ -270,7 +295,8 @@ def _try_step(problem: Problem, s: _State) -> _State:
     Q, force = problem.normal(s.T)
     graph = problem.graph
     matrix = anchored(graph.edges, Q, graph.num_poses, s.damping)
-    inverse = jax.lax.cond(s.usual > 0, lambda: s.inverse, lambda: multigrid(matrix))
+    kept = (s.cycle.usual > 0) & (s.cycle.moved < _MOVED * s.length)
+    inverse = jax.lax.cond(kept, lambda: s.cycle.inverse, lambda: multigrid(matrix))
     x, rounds = solve_block_flow(matrix, force, inverse, tolerance=1e-2)
     T = nearby_rotation(product(lie.exp(x), s.T))
     cost = problem.cost(T)
@@ -284,14 +310,17 @@ def _try_step(problem: Problem, s: _State) -> _State:
     # faster, as conjugate gradients leave some of each step undone.
     ratio = jnp.where(jnp.isfinite(s.gain), jnp.clip(gain / s.gain, _UNDONE, 1), 1)
     damping = jnp.where(better, eased, jnp.maximum(s.damping * 30, _DAMPED))
-    usual = jnp.where(s.usual > 0, s.usual, jnp.maximum(rounds, 1))
-    stale = rounds > _STALE * usual
+    usual = jnp.where(kept, s.cycle.usual, jnp.maximum(rounds, 1))
+    shift = jnp.max(jnp.abs(lie.translation(T) - lie.translation(s.T)))
+    moved = jnp.where(kept, s.cycle.moved, 0) + jnp.where(better, shift, 0)
+    # A cycle without damping knows nothing of a damped matrix.
+    stale = (rounds > _STALE * usual) | ~better
     return _State(
         T=jnp.where(better, T, s.T),
         cost=jnp.where(better, cost, s.cost),
         damping=damping,
-        inverse=inverse,
-        usual=jnp.where(stale, 0, usual),
+        cycle=Cycle(inverse, jnp.where(stale, 0, usual), moved),
+        length=s.length,
         gain=gain,
         next_gain=gain * ratio,
         step=s.step + 1,

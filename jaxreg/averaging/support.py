@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 from jaxreg.averaging.base import length_scale
 from jaxreg.averaging.tree import along_frames
 from jaxreg.geometry import lie
+from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph, product
 
 
@@ -15,17 +16,19 @@ from jaxreg.graph.pose_graph import PoseGraph, product
 # is compared with so many that follow it in their order; errors of agreement, radians
 # and length scales.
 _NEAR, _COMPARED, _AGREES = 8, 3, 0.3
-# What others count, and the share of confirmed closures below which all count.
+# What others count that hold a frame, and the share of confirmed closures below which
+# all count.
 _DOUBTED, _USUAL = 1e-3, 0.25
 
 
 def without_lone_closures(graph: PoseGraph) -> PoseGraph:
-    """The graph with less weight for closures that no other confirms.
+    """The graph without closures that no other confirms; little of those it hangs on.
 
     A sequence passes a place again for some frames and closes several loops there,
     which agree with each other along the frames between their ends. False closures
     stand alone as a rule. Where few closures are confirmed, as in graphs that are no
-    sequences, all keep their weight. For starts: nothing is left out.
+    sequences, all keep their weight. For starts: any weight of false closures bends a
+    long sequence, which hardly resists, so only those stay that join components.
     """
     successive = jnp.abs(graph.edges[:, 0] - graph.edges[:, 1]) == 1
     closure = (graph.weight > 0) & ~successive
@@ -33,6 +36,10 @@ def without_lone_closures(graph: PoseGraph) -> PoseGraph:
     usual = jnp.sum(supported) >= _USUAL * jnp.sum(closure)
     doubted = closure & ~supported & usual
     weight = jnp.where(doubted, _DOUBTED * graph.weight, graph.weight)
+    tree = trees.maximum_spanning_tree(
+        graph.edges, graph.T_i_j, weight, graph.num_poses
+    )
+    weight = jnp.where(doubted & ~tree.in_tree, 0, weight)
     return eqx.tree_at(lambda g: g.weight, graph, weight)
 
 

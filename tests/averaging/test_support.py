@@ -48,7 +48,19 @@ def test_a_lone_closure_among_confirmed_ones_is_doubted():
     graph, wrong = two_laps(closures, np.arange(len(closures)) >= LAP)
     weight = np.asarray(without_lone_closures(graph).weight)
     np.testing.assert_array_equal(weight[~wrong], 2)
-    assert np.all((weight[wrong] > 0) & (weight[wrong] < 0.01))
+    np.testing.assert_array_equal(weight[wrong], 0)
+
+
+def test_a_frame_is_not_lost_with_its_lone_closure():
+    closures = np.stack([np.arange(LAP), LAP + np.arange(LAP)], axis=1)
+    # The walk is cut before its last frame, which a lone closure alone holds.
+    closures = np.concatenate([closures[:-1], [[3, 25], [5, NUM - 1], [12, 51]]])
+    graph, _ = two_laps(closures, np.zeros(len(closures), bool))
+    cut = np.arange(graph.num_edges) == NUM - 2
+    graph = eqx.tree_at(lambda g: g.weight, graph, jnp.where(cut, 0, graph.weight))
+    weight = np.asarray(without_lone_closures(graph).weight)
+    held = (graph.edges == NUM - 1).any(axis=1) & ~cut
+    assert 0 < weight[held].item() < 0.01
 
 
 def test_where_no_closure_is_confirmed_all_keep_their_weight():
