@@ -5,7 +5,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,12 @@ def timed(fn: Callable[[], Any]) -> Timed:
 
 
 def in_turn(
-    methods: dict[str, Callable[..., Any]], cases: list[tuple], repeats: int
+    methods: dict[str, Callable[..., Any]],
+    cases: Sequence[tuple],
+    repeats: int,
+    *,
+    warm_up: bool = False,
+    before: Callable[[str], None] = lambda name: None,
 ) -> tuple[dict[str, Timed], dict[str, list[list[Timed]]], dict[str, str]]:
     """Calls all methods on each case in an order that changes.
 
@@ -36,6 +41,9 @@ def in_turn(
         methods: what to call, by name.
         cases: arguments of the calls.
         repeats: calls of each method on each case.
+        warm_up: whether each method is called once more on each case before those, as
+            where cases differ in shape and compile.
+        before: told the name of the method before each of its calls.
 
     Returns:
         The first call of each method, on the first case and apart from the others; its
@@ -46,10 +54,12 @@ def in_turn(
     failed: dict[str, str] = {}
 
     def attempt(name: str, case: tuple) -> Timed | None:
+        before(name)
         try:
             return timed(lambda: methods[name](*case))
         except Exception as err:  # another version of a peer, or out of memory
             failed[name] = f"failed: {str(err) or type(err).__name__}"
+            calls.pop(name, None)
             return None
 
     for name in methods:
@@ -58,12 +68,12 @@ def in_turn(
             first[name], calls[name] = call, [[] for _ in cases]
     order = np.random.default_rng(0)
     for at, case in enumerate(cases):
+        for name in list(calls) if warm_up and at else []:
+            attempt(name, case)
         for _ in range(repeats):
             for name in order.permutation(list(calls)).tolist():
                 call = attempt(name, case)
-                if call is None:
-                    del calls[name]
-                else:
+                if call is not None:
                     calls[name][at].append(call)
     return first, calls, failed
 

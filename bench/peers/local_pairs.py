@@ -7,25 +7,10 @@ points, normals, covariances and trees are inside. Distances are shares of the e
 """
 
 import importlib
-import inspect
-from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
-
-
-Solve = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
-
-
-class Method(NamedTuple):
-    """A way to register a pair: `solve` is None where the library is missing."""
-
-    name: str
-    parameters: str
-    solve: Solve | None
-    smallest: int = 0  # points below which the setting makes no sense
 
 
 def numpy_normals(points: np.ndarray, tree: KDTree, k: int) -> np.ndarray:
@@ -220,129 +205,36 @@ def open3d_tensor(
     ).transformation.numpy()
 
 
-def _method(
-    library: str, run: Callable, name: str, smallest: int = 0, **options: Any
-) -> Method:
-    """A peer with its options written out; without `solve` if it does not import."""
-    defaults = {
-        key: parameter.default
-        for key, parameter in inspect.signature(run).parameters.items()
-        if parameter.default is not inspect.Parameter.empty
-    }
-    text = ", ".join(f"{key}={x}" for key, x in (options | defaults | options).items())
-    try:
-        importlib.import_module(library)
-    except (ImportError, OSError) as err:
-        reason = "not installed" if isinstance(err, ModuleNotFoundError) else str(err)
-        return Method(name, reason, None, smallest)
-    return Method(name, text, partial(run, **options), smallest)
-
-
-FULL = ((0, 0.1),)  # one stage on all points
-
-
-def peers() -> list[Method]:
-    """All peers, each with the best settings found for this task.
-
-    `stages` are (voxel size or 0 for all points, largest distance of a pair), shares
-    of the extent. Settings that thin the clouds have rows of their own.
-    """
-    return [
-        _method(
-            "scipy",
-            numpy_plane,
-            "NumPy+SciPy plane",
-            reach=0.1,
-            k=10,
-            steps=40,
-            stop=3e-4,
-        ),
-        *_small_gicp_peers(),
-        *_open3d_peers(),
-    ]
-
-
-def _small_gicp_peers() -> list[Method]:
-    own = partial(_method, "small_gicp", small_gicp)
-    return [
-        own("small_gicp ICP", kind="ICP", stages=FULL),
-        own("small_gicp PLANE", kind="PLANE_ICP", stages=FULL),
-        own(
-            "small_gicp PLANE tight",
-            kind="PLANE_ICP",
-            stages=FULL,
-            turn_deg=0.01,
-            shift=1e-4,
-        ),
-        own("small_gicp GICP", kind="GICP", stages=FULL),
-        own("small_gicp GICP k=6", kind="GICP", stages=FULL, k=6),
-        own("small_gicp GICP 2-stage", kind="GICP", stages=((0.05, 0.1), (0, 0.02))),
-        *(
-            own(
-                f"small_gicp GICP voxel {voxel}",
-                smallest=smallest,
-                kind="GICP",
-                stages=((voxel, 0.1),),
-            )
-            for voxel, smallest in ((0.03, 0), (0.02, 2_000), (0.01, 2_000))
-        ),
-        own(
-            "small_gicp GICP voxels .04 .01",
-            smallest=2_000,
-            kind="GICP",
-            stages=((0.04, 0.1), (0.01, 0.03)),
-        ),
-        own("small_gicp GICP voxel 0.005", 50_000, kind="GICP", stages=((0.005, 0.1),)),
-        own(
-            "small_gicp PLANE voxel 0.01",
-            smallest=10_000,
-            kind="PLANE_ICP",
-            stages=((0.01, 0.1),),
-        ),
-        _method(
-            "small_gicp",
-            small_vgicp,
-            "small_gicp VGICP",
-            cell=0.02,
-            voxel=1e-5,
-            reach=0.1,
-        ),
-        _method(
-            "small_gicp",
-            small_vgicp,
-            "small_gicp VGICP voxel 0.01",
-            smallest=2_000,
-            cell=0.02,
-            voxel=0.01,
-            reach=0.1,
-        ),
-    ]
-
-
-def _open3d_peers() -> list[Method]:
-    own = partial(_method, "open3d", open3d)
-    return [
-        own("Open3D point", kind="point", stages=FULL),
-        own("Open3D plane", kind="plane", stages=FULL),
-        own("Open3D plane 2-stage", kind="plane", stages=((0.03, 0.1), (0, 0.02))),
-        own("Open3D plane voxel 0.01", 10_000, kind="plane", stages=((0.01, 0.1),)),
-        own("Open3D GICP", kind="gicp", stages=FULL, k=10),
-        own("Open3D GICP voxel 0.01", 10_000, kind="gicp", stages=((0.01, 0.1),), k=10),
-        _method(
-            "open3d",
-            open3d_tensor,
-            "Open3D tensor plane 2-stage",
-            stages=((0.02, 0.1), (0, 0.02)),
-            k=20,
-        ),
-    ]
-
-
-def solve_many(
-    task: tuple[str, list[tuple[np.ndarray, np.ndarray]], float],
+def filter_reg(
+    source: np.ndarray, target: np.ndarray, extent: float, *, sigma: float
 ) -> np.ndarray:
-    """Poses of a list of pairs by the peer of that name, for a worker process."""
-    name, pairs, extent = task
-    solve = next(x.solve for x in peers() if x.name == name)
-    assert solve is not None
-    return np.stack([solve(s, t, extent) for s, t in pairs])
+    """FilterReg of probreg, point-to-plane, its width starting at a share of extent."""
+    lib: Any = importlib.import_module("probreg.filterreg")
+    target = target.astype(np.float64)
+    found = lib.registration_filterreg(
+        source.astype(np.float64),
+        target,
+        numpy_normals(target, KDTree(target), 10),
+        sigma2=(sigma * extent) ** 2,
+        update_sigma2=True,
+        objective_type="pt2pl",
+        maxiter=50,
+        tol=1e-6 * extent,
+    )
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = found.transformation.rot, found.transformation.t
+    return T
+
+
+def coherent_drift(
+    source: np.ndarray, target: np.ndarray, extent: float, *, steps: int
+) -> np.ndarray:
+    """Rigid coherent point drift of pycpd, in the unit of the extent."""
+    lib: Any = importlib.import_module("pycpd")
+    moving, fixed = (x.astype(np.float64) / extent for x in (source, target))
+    solver = lib.RigidRegistration(X=fixed, Y=moving, scale=False, max_iterations=steps)
+    solver.register()
+    T = np.eye(4)
+    # Points are rows there: moved = points @ R + t.
+    T[:3, :3], T[:3, 3] = solver.R.T, extent * np.ravel(solver.t)
+    return T

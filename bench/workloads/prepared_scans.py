@@ -1,6 +1,5 @@
 """Searches between real scans, prepared once or by plain calls of `register`."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,12 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bench.global_data import ScanPairs
-from bench.timing import Timed, timed
-from jaxreg import Status, register
+from bench.workloads.global_data import ScanPairs
 from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.neighbours import VoxelTable
-from jaxreg.particle import AbstractSearch, GivenParticles, MultiStart
+from jaxreg.particle import AbstractSearch
 
 
 class Prepared(NamedTuple):
@@ -22,15 +19,6 @@ class Prepared(NamedTuple):
     cloud: PointCloud
     table: VoxelTable
     centre: jax.Array
-
-
-class Result(NamedTuple):
-    """Of a pair: the pose, its score, whether its method believes it, its time."""
-
-    T_target_source: np.ndarray
-    score: float
-    believed: bool
-    seconds: float
 
 
 def padded(points: ScanPairs) -> tuple[np.ndarray, np.ndarray]:
@@ -47,27 +35,15 @@ class Own:
     """Searches between scans that are prepared once."""
 
     def __init__(self, method: AbstractSearch, data: ScanPairs) -> None:
-        """Prepares; the time a scan is `prepare_s`."""
+        """Prepares all scans."""
         points, mask = (jnp.asarray(x) for x in padded(data))
         self.method = method
         self.radius = jnp.median(jax.vmap(rms_radius)(points, mask))
         scans = list(zip(points, mask, strict=True))
-        self._prepare(*scans[0])
-        took = timed(lambda: [self._prepare(*scan) for scan in scans])
-        self.scans: list[Prepared] = took.value
-        self.prepare_s = took.cpu / len(scans)
+        self.scans: list[Prepared] = [self._prepare(*scan) for scan in scans]
 
     def _prepare(self, points: jax.Array, mask: jax.Array) -> Prepared:
         return jax.block_until_ready(_prepare(self.method, points, mask, self.radius))
-
-    def at(self, source: int, target: int, T: np.ndarray) -> float:
-        """The score of a pose after a refinement from there."""
-        near = MultiStart(num_starts=1, num_steps=1, num_modes=1, width_start=0.06)
-        T = np.linalg.inv(self._frame(target)) @ T @ self._frame(source)
-        T[:3, 3] /= float(self.radius)
-        given = GivenParticles(T.astype(np.float32)[None])
-        near = eqx.tree_at(lambda m: m.prior, near, given, is_leaf=lambda x: x is None)
-        return float(self.solve(source, target, 0, near)[1].overlap)
 
     def solve(
         self,
@@ -109,43 +85,3 @@ def _search(method: AbstractSearch, source: Prepared, target: Prepared, key: jax
     return method.solve_indexed(
         source.cloud, target.cloud, source.table, target.table, None, key
     )
-
-
-def run_own(own: Own, data: ScanPairs) -> list[Result]:
-    """Every pair, by prepared scans."""
-    own.solve(1, 0, 0)
-
-    def one(pair: int) -> Result:
-        target, source = data.pairs[pair].tolist()
-        took = timed(lambda: own.solve(source, target, pair))
-        return _result(took)
-
-    return [one(pair) for pair in range(len(data.pairs))]
-
-
-def run_register(data: ScanPairs) -> list[Result]:
-    """Every pair, by `register` on all points of the scans."""
-    points, mask = padded(data)
-
-    def call(pair: int) -> tuple[np.ndarray, Any]:
-        target, source = data.pairs[pair]
-        key = jax.random.key(pair)
-        found = register(
-            points[source],
-            points[target],
-            key=key,
-            source_mask=mask[source],
-            target_mask=mask[target],
-        )
-        found = jax.device_get(found)
-        return np.asarray(found.T_target_source, np.float64), found
-
-    call(0)
-    calls = [timed(partial(call, pair)) for pair in range(len(data.pairs))]
-    return [_result(took) for took in calls]
-
-
-def _result(took: Timed) -> Result:
-    T, found = took.value
-    believed = int(found.status) == Status.CONVERGED
-    return Result(T, float(found.overlap), believed, took.cpu)

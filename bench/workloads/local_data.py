@@ -1,11 +1,12 @@
 """Pairs of point sets with known motion, and errors of the motions found."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from bench.case import Judged
+from bench.records import Metric, error, share
 from jaxreg.datasets import sculpture_scans
 from jaxreg.io.stanford import read_conf
 
@@ -26,15 +27,15 @@ class Shape(NamedTuple):
     extent: float
 
 
-def load(folder: Path) -> Shape:
+def load(folder: Path | None) -> Shape:
     """The Bunny's scans in one frame, or the generated sculpture's."""
-    bunny = folder / "stanford_bunny"
-    if (bunny / "bunny_scans.npz").exists():
+    bunny = None if folder is None else folder / "stanford_bunny"
+    if bunny is not None and (bunny / "bunny_scans.npz").exists():
         name, poses = "Stanford Bunny", read_conf(bunny / "bun.conf")
         with np.load(bunny / "bunny_scans.npz") as file:
             scans = [(file[key], T) for key, T in poses.items()]
     else:
-        name = f"generated sculpture (no {bunny})"
+        name = "generated sculpture"
         parts, T_world_i = sculpture_scans(12, seed=0, points_per_scan=20_000)
         scans = list(zip(parts, T_world_i, strict=True))
     moved = [x @ T[:3, :3].T + T[:3, 3] for x, T in scans]
@@ -74,14 +75,17 @@ def errors(T: np.ndarray, pair: Draw, extent: float) -> tuple[float, float]:
     return float(np.degrees(2 * np.arcsin(min(chord, 1)))), float(100 * shift / extent)
 
 
-def accuracy(found: Iterable[np.ndarray], pairs: list[Draw], extent: float) -> dict:
-    """Medians and maxima of the errors, and the share of successes."""
+def accuracy(found: list[np.ndarray], pairs: list[Draw], extent: float) -> Judged:
+    """Medians with quartiles and maxima of the errors, and the share of successes."""
     scores = [errors(T, pair, extent) for T, pair in zip(found, pairs, strict=True)]
     rot, shift = np.array(scores).T
-    return {
-        "e_rot_deg": float(np.median(rot)),
-        "e_rot_deg_max": float(rot.max()),
-        "e_trans_percent": float(np.median(shift)),
-        "e_trans_percent_max": float(shift.max()),
-        "success": float(np.mean((rot < 1) & (shift < 1))),
-    }
+    ok = (rot < 1) & (shift < 1)
+    return Judged(
+        [
+            share("success", ok, 100 / len(ok) + 1e-6),
+            error("e_rot", float(np.median(rot)), "deg", 0.005),
+            error("e_trans", float(np.median(shift)), "% of extent", 0.005),
+            Metric("e_rot_max", float(rot.max()), "deg", "down"),
+        ],
+        {"e_rot": rot.tolist()},
+    )

@@ -1,0 +1,86 @@
+"""What a workload hands over to be measured: cases, and methods that solve them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bench.records import Metric
+
+
+#: Takes the arguments of a trial, returns its answer in NumPy arrays.
+Solve = Callable[..., Any]
+
+
+class Options(NamedTuple):
+    """What a workload is told: small generated cases only, and where data lie."""
+
+    quick: bool
+    data: Path
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to solve a case.
+
+    Attributes:
+        name: in its row.
+        library: the package that is measured, as in `bench.peers.PEERS`, or "jaxreg".
+        parameters: written out for the reader.
+        solve: called on every trial.
+        prepare: where something is built once for all trials, what returns `solve`;
+            its time is a metric of its own.
+        in_processes: whether `solve` works in other processes, whose CPU time is not
+            that of this one.
+        on_accelerator: whether `solve` is JAX on arrays of its own and gets a second
+            row where there is an accelerator.
+    """
+
+    name: str
+    library: str
+    parameters: str
+    solve: Solve | None = None
+    prepare: Callable[[], Solve] | None = None
+    in_processes: bool = False
+    on_accelerator: bool = False
+
+
+class Judged(NamedTuple):
+    """Accuracy over all trials, and values of single trials for the plots."""
+
+    metrics: list[Metric]
+    samples: dict[str, list[float]] = {}
+
+
+@dataclass(frozen=True)
+class Case:
+    """Trials that all methods solve.
+
+    Attributes:
+        name: in its rows; with `x`, of `x_label`, where cases form a series.
+        data: what the trials are made of, as told to the reader.
+        methods: what solves them.
+        trials: arguments of `solve`.
+        judge: accuracy of the answers, one for each trial.
+        repeats: timed calls of each method on each trial; five calls at the least.
+        reference: the method that others are compared with in time.
+        items: things that a call handles, named `item`, for a rate; 0 for none.
+        warm_up: whether trials differ in shape, so that each compiles.
+    """
+
+    name: str
+    data: str
+    methods: Sequence[Method]
+    trials: Sequence[tuple]
+    judge: Callable[[list[Any]], Judged]
+    repeats: int = 1
+    reference: str = ""
+    items: int = 0
+    item: str = ""
+    warm_up: bool = False
+    x: float | None = None
+    x_label: str = ""
+
+    def __post_init__(self) -> None:
+        if self.repeats * len(self.trials) < 5:
+            raise ValueError(f"{self.name}: fewer than five calls of each method")

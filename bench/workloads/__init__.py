@@ -1,0 +1,122 @@
+"""Workloads: each module has `cases(options)`, which yields what is measured.
+
+A workload runs in a process of its own, pinned to its cores, so that one cannot disturb
+the next: neither by precision, nor by memory, nor by a crash.
+"""
+
+from typing import Literal, NamedTuple
+
+
+class Workload(NamedTuple):
+    """What is known of a workload before its process starts.
+
+    Attributes:
+        title: for the report.
+        text: what it measures and how, for the report.
+        cores: that its process is pinned to: one, or all that there are.
+        double: whether JAX computes in float64 where asked.
+        quick: whether it has cases of `--quick`.
+    """
+
+    title: str
+    text: str
+    cores: Literal["one", "all"] = "one"
+    double: bool = False
+    quick: bool = True
+
+
+WORKLOADS = {
+    "local_pairs": Workload(
+        "Local registration of a pair",
+        "Disjoint random subsets of an object, the source turned by 10 degrees about a "
+        "random axis through its centroid and moved by 5 % of the extent (the diagonal "
+        "of the bounding box). All start from the identity. What is timed runs from "
+        "NumPy points to a pose: conversion, normals, covariances and trees included. "
+        "Success: below 1 degree and 1 % of the extent at the source's centroid.",
+    ),
+    "local_batch": Workload(
+        "Local registration of many pairs",
+        "Pairs as above, all in one call: one `register` of a batch, and the peers "
+        "with as many threads or processes as there are cores.",
+        cores="all",
+        quick=False,
+    ),
+    "global_horse": Workload(
+        "Global registration of a horse",
+        "The PF paper's horse (400 points on 4,000) by its own protocol, under any "
+        "rotation, and one half of it, with noise. Success as in the paper: 10 "
+        "degrees, and 5 units at the model's middle. The target is prepared once where "
+        "the method allows it, apart from the time of a trial.",
+    ),
+    "global_scans": Workload(
+        "Global registration of real scans",
+        "All pairs of the Bunny's and of the Dragon's scans, no guess. Scans are "
+        "prepared once, apart from the time of a pair. Right: within 5 degrees and 5 "
+        "mm at the source's centroid. Believed: what the method itself reports as "
+        "found.",
+        quick=False,
+    ),
+    "look_ups": Workload(
+        "Success against look-ups",
+        "Searches that may look up equally many closest points: the filter, the filter "
+        "without dynamics or with constant velocity, and plain descents from many "
+        "starts.",
+        quick=False,
+    ),
+    "neighbours": Workload(
+        "Closest points",
+        "Targets on a sculpture; queries near its surface and after a turn of 10 "
+        "degrees. Trees are built once, apart. `exact` is the share of answers that "
+        "are the closest point.",
+    ),
+    "averaging_outliers": Workload(
+        "Motion averaging with outliers",
+        "Random graphs, noise of 0.5 degrees and 0.5 % of the size, a share of the "
+        "motions uniformly random; from the motions alone. Success: mean errors within "
+        "5 degrees and 5 % in the best common frame.",
+    ),
+    "averaging_logs": Workload(
+        "Motion averaging of real logs",
+        "Relative motions that fast global registration found between the views of "
+        "indoor scenes, most of them wrong. `frames` is the share of frames within the "
+        "bounds in the common frame that has most of them.",
+        quick=False,
+    ),
+    "pose_graphs": Workload(
+        "Public pose graphs",
+        "Graphs with published optima, from the motions alone, float64. `ratio` is "
+        "SE-Sync's chordal objective over the optimum.",
+        double=True,
+        quick=False,
+    ),
+    "large_graphs": Workload(
+        "Large graphs",
+        "A path in rings of 100 poses, 3.85 edges a pose, noise of 1 degree and 0.02 "
+        "of a step; from the motions alone, float64.",
+        double=True,
+    ),
+    "multiview": Workload(
+        "Many scans into one frame",
+        "Scans to poses, no guess. Errors are those of the MCC paper, e_R and e_t, "
+        "with scan 0 as the common frame.",
+    ),
+    "gradients": Workload(
+        "Gradients",
+        "Gradients of a sum over the answer beside the answer itself, float64, and how "
+        "far a derivative is off what it must be.",
+        double=True,
+    ),
+    "compile_times": Workload(
+        "Compile times",
+        "Tracing and compiling after caches were emptied, beside "
+        " the compilation of a fixed program of XLA.",
+        quick=False,
+    ),
+    "devices": Workload(
+        "Devices",
+        "Throughput on the CPU and, where there is one, the accelerator: the same "
+        "code.",
+        cores="all",
+        quick=False,
+    ),
+}

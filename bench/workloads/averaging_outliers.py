@@ -1,0 +1,107 @@
+"""Break-down over the share of outliers: random graphs from the motions alone."""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from bench.averaging_outliers import METHODS, SHARES, SIZES
+from bench.averaging_outliers import judge as errors_of
+from bench.case import Case, Judged, Method, Options
+from bench.peers.pose_graphs import SIGMAS, robust
+from bench.records import error, share
+from bench.workloads.local_pairs import written_out
+from jaxreg.averaging import AbstractAverager, average
+from jaxreg.graph import PoseGraph
+from tests.averaging.graphs import random_graph
+
+
+SEEDS = 20
+
+
+def cases(options: Options) -> Iterator[Case]:
+    """A case per size and share of outliers."""
+    sizes = ((32, 465),) if options.quick else SIZES
+    for num, edges in sizes:
+        for outliers in (0.5,) if options.quick else SHARES:
+            if num == 12 and outliers > 0.55:
+                continue  # hardly any such graph is connected by its inliers
+            count = 6 if options.quick else SEEDS
+            drawn = [random_graph(num, edges, outliers, seed) for seed in range(count)]
+            yield Case(
+                name=f"{num} poses, {edges} edges, {outliers:.0%} wrong",
+                data="generated graphs",
+                methods=methods(options.quick),
+                trials=[_trial(*graph[:3]) for graph in drawn],
+                judge=partial(judge, drawn),
+                repeats=4 if options.quick else 1,
+                reference="GTSAM GNC",
+                x=100 * outliers,
+                x_label=f"% of outliers, {num} poses and {edges} edges",
+            )
+
+
+def _trial(X: np.ndarray, edges: np.ndarray, T: np.ndarray) -> tuple:
+    """The graph, and its edges, motions and number of poses for the peers."""
+    T = T.astype(np.float32)
+    return PoseGraph.from_edges(edges, T, len(X)), edges, T, len(X)
+
+
+def methods(quick: bool) -> list[Method]:
+    """Averagers of jaxreg, the default alone when quick, then GTSAM."""
+    own = [
+        Method(f"jaxreg {k}", "jaxreg", written_out(m), partial(_own, m))
+        for k, m in METHODS.items()
+        if k == "default" or not quick
+    ]
+    text = f"from a breadth-first tree, deviations {SIGMAS[0]:g} degrees, {SIGMAS[1]:g}"
+    kernels = {
+        "GTSAM GNC": "GNC",
+        "GTSAM Huber, Geman-McClure": "Huber",
+    }
+    return own + [
+        Method(k, "gtsam", text, partial(_gtsam, kernel))
+        for k, kernel in kernels.items()
+    ]
+
+
+def _own(method: AbstractAverager, graph: PoseGraph, *_: Any) -> np.ndarray:
+    return np.asarray(average(graph, method).T_world_i)
+
+
+def _gtsam(
+    kernel: str, graph: PoseGraph, edges: np.ndarray, T: np.ndarray, num: int
+) -> np.ndarray:
+    # It takes rotations of float64 accuracy.
+    return robust(edges, _orthonormal(T), num, kernel=kernel)
+
+
+def _orthonormal(T: np.ndarray) -> np.ndarray:
+    T = T.astype(np.float64)
+    U, _, Vt = np.linalg.svd(T[:, :3, :3])
+    T[:, :3, :3] = U @ Vt
+    return T
+
+
+def judge(drawn: list, answers: list[Any]) -> Judged:
+    """Success, right frames, and the errors of what succeeded."""
+    rows = []
+    for (X, edges, T, _), found in zip(drawn, answers, strict=True):
+        graph = PoseGraph.from_edges(edges, T.astype(np.float32), len(X))
+        true = jnp.asarray(X, jnp.float32)
+        rows.append(errors_of(graph, jnp.asarray(found, jnp.float32), true))
+    e_R, e_t, frames, _ = np.array(rows, dtype=np.float64).T
+    ok = (e_R < np.deg2rad(5)) & (e_t < 0.05)
+    metrics = [
+        share("success", ok, 100 * max(1.0, 0.05 * len(ok)) / len(ok) + 1e-6),
+        error("wrong frames", 100 * float(1 - frames.mean()), "%", 5.0),
+    ]
+    if ok.any():
+        degrees = float(np.rad2deg(np.median(e_R[ok])))
+        metrics += [
+            error("e_rot", degrees, "deg", 0.005),
+            error("e_trans", 100 * float(np.median(e_t[ok])), "% of size", 0.005),
+        ]
+    return Judged(metrics, {"e_rot": np.rad2deg(e_R).tolist()})

@@ -1,0 +1,125 @@
+"""Throughput of batches: on the CPU, and on an accelerator where there is one.
+
+Methods take a second row on the accelerator (see `bench.worker`). What bounds a method
+is counted and told with it, so that its rate can be held against the device's figures.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bench.averaging_scale import H, N, small_graph
+from bench.case import Case, Judged, Method, Options
+from bench.particle_data import horse, horse_model
+from bench.particle_horse import ours
+from bench.particle_run import look_ups
+from bench.records import Metric, share
+from bench.workloads.global_horse import judge as judge_horse
+from bench.workloads.local_pairs import written_out
+from bench.workloads.neighbours import queries_off, sculpture_points
+from jaxreg import register
+from jaxreg.averaging import average
+from jaxreg.graph import PoseGraph
+from jaxreg.metrics import rotation_errors, translation_errors
+from jaxreg.neighbours import BruteForce
+
+
+HORSES, GRAPHS, TARGETS, QUERIES = 200, 64, 10_000, 16_384
+
+
+def cases(options: Options) -> Iterator[Case]:
+    """Pairs, particles, closest points and graphs a second."""
+    yield _horses(options)
+    yield _closest()
+    yield _graphs()
+
+
+def _case(name: str, data: str, method: Method, items: int, item: str, judge) -> Case:  # noqa: ANN001
+    return Case(
+        name=name,
+        data=data,
+        methods=[method],
+        trials=[()],
+        judge=judge,
+        repeats=5,
+        items=items,
+        item=item,
+    )
+
+
+def _horses(options: Options) -> Case:
+    folder = options.data / "horse"
+    trials = horse(HORSES, 0.25, horse_model(folder))
+    target = np.broadcast_to(trials.target, (HORSES, *trials.target.shape))
+
+    def solve() -> np.ndarray:
+        found = register(trials.source, target, ours(), key=jax.random.key(0))
+        return np.asarray(found.T_target_source, float)
+
+    each = look_ups(ours(), trials)
+    text = f"{written_out(ours())}; {each} closest points a pair at most"
+    method = Method("jaxreg register", "jaxreg", text, solve, on_accelerator=True)
+    name = f"{HORSES} horses in one call, 25 % noise"
+    scanned = (folder / "horse.ply.gz").is_file()
+    data = "scanned horse" if scanned else "generated horse"
+    return _case(
+        name, data, method, HORSES, "pairs", lambda x: judge_horse(trials, list(x[0]))
+    )
+
+
+def _closest() -> Case:
+    target = sculpture_points(TARGETS, seed=0)
+    columns = queries_off(target, 10, QUERIES).T
+    look = jax.jit(lambda index, x: index.lookup(x))
+
+    def solve() -> np.ndarray:
+        index = BruteForce.build(jnp.asarray(target))
+        return np.asarray(look(index, jnp.asarray(columns)))
+
+    work = 8 * TARGETS * QUERIES / 1e9
+    text = f"brute force; {work:.2f} billion operations a call"
+    method = Method("jaxreg BruteForce", "jaxreg", text, solve, on_accelerator=True)
+    name = f"{QUERIES} closest of {TARGETS}"
+    truth = solve()
+    return _case(
+        name, "generated sculpture", method, QUERIES, "queries", partial(_same, truth)
+    )
+
+
+def _same(truth: np.ndarray, answers: list[Any]) -> Judged:
+    same = 100 * float(np.mean(answers[0] == truth))
+    return Judged([Metric("same as on the CPU", same, "%", "up", 1.0)])
+
+
+def _graphs() -> Case:
+    rng = np.random.default_rng(0)
+    drawn = [small_graph(rng) for _ in range(GRAPHS)]
+    X, edges, T = (np.stack(x) for x in zip(*drawn, strict=True))
+    many = jax.jit(lambda g: jax.lax.map(average, g))
+
+    def solve() -> np.ndarray:
+        graphs = PoseGraph(
+            edges=jnp.asarray(edges, jnp.int32),
+            T_i_j=jnp.asarray(T, jnp.float32),
+            weight=jnp.ones((GRAPHS, H), jnp.float32),
+            mask=jnp.ones((GRAPHS, H), bool),
+            information=None,
+            num_poses=N,
+        )
+        return np.asarray(many(graphs).T_world_i)
+
+    method = Method("jaxreg average", "jaxreg", "lax.map", solve, on_accelerator=True)
+    name = f"{GRAPHS} graphs of {N} poses, {H} edges, 30 % wrong"
+    return _case(name, "generated graphs", method, GRAPHS, "graphs", partial(_right, X))
+
+
+def _right(X: np.ndarray, answers: list[Any]) -> Judged:
+    found, true = jnp.asarray(answers[0]), jnp.asarray(X, jnp.float32)
+    e_R = jax.vmap(lambda a, b: jnp.mean(rotation_errors(a, b, "best")))(found, true)
+    e_t = jax.vmap(lambda a, b: jnp.mean(translation_errors(a, b, "best")))(found, true)
+    right = (np.rad2deg(e_R) < 5) & (np.asarray(e_t) < 0.05)
+    return Judged([share("success", right.tolist(), 5.0)])

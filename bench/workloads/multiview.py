@@ -1,0 +1,100 @@
+"""Scans into one frame without a guess: the Bunny, the Dragon, a made sculpture."""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bench.case import Case, Judged, Method, Options
+from bench.motion_scans import SETS, load_scans
+from bench.peers.multiview import Multiway
+from bench.records import Metric, error
+from jaxreg import reconstruct
+from jaxreg.datasets import sculpture_scans
+from jaxreg.metrics import rotation_error, translation_error
+
+
+class Scans(NamedTuple):
+    """Scans in metres with their truth, and what a user knows of them.
+
+    Attributes:
+        voxel: about five times the distance of points.
+        least: share of points that must meet; smooth surfaces ask for more.
+        camera_at_origin: whether frames are those of the scanner.
+    """
+
+    name: str
+    scans: list[np.ndarray]
+    T_world_i: np.ndarray
+    voxel: float
+    least: float
+    camera_at_origin: bool
+
+
+def cases(options: Options) -> Iterator[Case]:
+    """A case per object."""
+    for data in _quick() if options.quick else _full(options):
+        method = Multiway(
+            data.voxel,
+            0.4 * data.voxel,
+            data.least,
+            camera_at_origin=data.camera_at_origin,
+        )
+        yield Case(
+            name=data.name,
+            data=f"{len(data.scans)} scans of {len(data.scans[0])} points",
+            methods=[
+                Method("jaxreg reconstruct", "jaxreg", "defaults", _own),
+                Method(
+                    "Open3D FPFH + RANSAC, multiway",
+                    "open3d",
+                    f"all pairs, {method}",
+                    method.solve,
+                ),
+            ],
+            trials=[(data.scans, seed) for seed in range(5)],
+            judge=partial(judge, data.T_world_i),
+            reference="Open3D FPFH + RANSAC, multiway",
+        )
+
+
+def _quick() -> Iterator[Scans]:
+    scans, T_world_i = sculpture_scans(8, seed=0, points_per_scan=2_000)
+    yield Scans("sculpture, 8 views", scans, T_world_i, 0.0075, 0.5, False)
+
+
+def _full(options: Options) -> Iterator[Scans]:
+    scans, T_world_i = sculpture_scans(12, seed=0)
+    yield Scans("sculpture, 12 views", scans, T_world_i, 0.005, 0.5, False)
+    for name, (folder, file, _) in SETS.items():
+        if (options.data / folder / file).exists():
+            title, scans, T_world_i = load_scans(name, options.data)
+            yield Scans(title, scans, T_world_i, 0.0025, 0.3, True)
+
+
+def _own(scans: list[np.ndarray], seed: int) -> np.ndarray:
+    found = reconstruct(scans, key=jax.random.key(seed))
+    placed = np.asarray(found.placed)[:, None, None]
+    return np.where(placed, np.asarray(found.T_world_i), np.nan)
+
+
+def judge(T_true: np.ndarray, answers: list[Any]) -> Judged:
+    """Scans placed, and mean errors of those, medians over the runs."""
+    placed, e_R, e_t = [], [], []
+    for T in answers:
+        some = ~np.isnan(T[:, 0, 0])
+        placed.append(100 * some.mean())
+        found, true = (jnp.asarray(x[some], jnp.float32) for x in (T, T_true))
+        e_R.append(float(rotation_error(found, true)))
+        e_t.append(1e3 * float(translation_error(found, true)))
+    return Judged(
+        [
+            Metric("placed", float(np.median(placed)), "%", "up", 1.0),
+            error("e_R", float(np.median(e_R)), "rad", 2e-4),
+            error("e_t", float(np.median(e_t)), "mm", 0.02),
+        ],
+        {"e_R": e_R},
+    )
