@@ -181,7 +181,13 @@ def _scores(
         return exact_index(cloud.mask.shape[0]).build(cloud.points, cloud.mask)
 
     both = score_both_ways(
-        source, target, indexed(source), indexed(target), T[None], spacing
+        source,
+        target,
+        indexed(source),
+        indexed(target),
+        T[None],
+        jnp.ones(1, bool),
+        spacing,
     )
     there, back = jax.tree.map(lambda x: x[0], both)
     return there, back

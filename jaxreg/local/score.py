@@ -118,15 +118,30 @@ def score_both_ways(
     source_index: AbstractIndex,
     target_index: AbstractIndex,
     T_target_source: Float[Array, "q D D"],
+    used: Bool[Array, " q"],
     spacing: Float[Array, ""],
 ) -> tuple[Score, Score]:
-    """Scores of the source on the target and of the target on the source, at poses."""
+    """Scores of the source on the target and of the target on the source, at poses.
+
+    Those of poses that are not in use are zero.
+    """
     source, target = levelled(source, target)
     forward = Problem.of(source, target, target_index), T_target_source
     backward = Problem.of(target, source, source_index), lie.inverse(T_target_source)
 
     def scores(way: tuple[Problem, Array]) -> Score:
         problem, T = way
-        return lax.map(lambda T: score(problem, T, spacing), T)
+
+        def one(pose: tuple[Motion, Array]) -> Score:
+            return lax.cond(
+                pose[1], lambda T: score(problem, T, spacing), _no_score, pose[0]
+            )
+
+        return lax.map(one, (T, used))
 
     return on_both(scores, forward, backward)
+
+
+def _no_score(T: Motion) -> Score:
+    none = jnp.zeros((), jnp.int32)
+    return Score(jnp.zeros((), T.dtype), jnp.zeros((), T.dtype), none, none)

@@ -71,12 +71,11 @@ class Pair(eqx.Module):
         )
 
     def scores(
-        self, T: Float[Array, "q D D"], spacing: Scalar
+        self, T: Float[Array, "q D D"], used: Bool[Array, " q"], spacing: Scalar
     ) -> tuple[Score, Float[Array, " q"]]:
-        """Of the source on the target at poses, and the overlap."""
-        there, back = score_both_ways(
-            self.source, self.target, self.source_index, self.target_index, T, spacing
-        )
+        """Of the source on the target at poses in use, and the overlap."""
+        clouds = self.source, self.target, self.source_index, self.target_index
+        there, back = score_both_ways(*clouds, T, used, spacing)
         return there, mutual_overlap(there, back)
 
 
@@ -113,7 +112,7 @@ def conclude(
     T_modes, sound = _refined(
         pair.problem, kernel, T_modes, mass > 0, spacing, refine_steps
     )
-    there, overlap = pair.scores(T_modes, spacing)
+    there, overlap = pair.scores(T_modes, sound, spacing)
     overlap = jnp.where(sound, overlap, -1)
     order = jnp.argsort(-overlap) if refine_steps else jnp.arange(num_modes)
     T_modes, mass, overlap, there = jax.tree.map(

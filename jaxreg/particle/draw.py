@@ -26,7 +26,7 @@ from jaxreg.particle.state import Particles
 # Blocks in a group; one of them is settled.
 _BLOCKS = 4
 # Steps with falling width.
-SETTLE_STEPS = 12
+SETTLE_STEPS = 16
 # Settled particles within this, in radians and radii, agree; farther apart than that,
 # they are rivals.
 _SAME, _APART = 0.1, 0.3

@@ -55,7 +55,7 @@ class MultiStart(AbstractSearch):
     num_steps: int = eqx.field(default=27, static=True)
     refine_steps: int = eqx.field(default=24, static=True)
     num_points: int = eqx.field(default=400, static=True)
-    num_modes: int = eqx.field(default=8, static=True)
+    num_modes: int = eqx.field(default=16, static=True)
     max_points: int = eqx.field(default=4096, static=True)
     batch_size: int = eqx.field(default=32, static=True)
     prior: AbstractPrior | None = None

@@ -52,10 +52,13 @@ def test_energies_are_their_equations(kind):
     cosine = np.sum((NORMALS @ T[:3, :3].T) * NORMALS[row], 1)
     height = np.sum(NORMALS[row] * (POINTS[row] - moved), 1)
     along = distance**2 - height**2
+    support = 1 / (1 + (height**2 + 0.04 * along) / (0.6 * WIDTH) ** 2)
+    over = (height / (1.5 * WIDTH)) ** 2
+    conflict = 4 * over / (1 + over) ** 2 / (1 + (along / WIDTH**2) ** 2)
     energy, value = {
         "bounded": (
             BoundedEnergy(slide=0.2, narrow=0.6),
-            1 - cosine**2 / (1 + (height**2 + 0.04 * along) / (0.6 * WIDTH) ** 2),
+            1 - cosine**2 * (support - conflict),
         ),
         "squared": (SquaredEnergy(), distance**2),
         "absolute": (AbsoluteEnergy(0.05), np.sqrt(distance**2 + 0.05**2)),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import blob, motion, move, pose_error
 from jaxtyping import Array
+from scipy.spatial import KDTree
 
 from jaxreg import Status
 from jaxreg._core.arrays import traced
@@ -46,8 +47,9 @@ STARTS = np.stack([motion(i, 2, shift=0.3) for i in range(P)])
 
 
 def _cloud(points: np.ndarray) -> PointCloud:
-    # On a curve about the origin the radius is nearly the normal.
-    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    near = points[KDTree(points).query(points, 6)[1]]
+    near = near - near.mean(axis=1, keepdims=True)
+    normals = np.linalg.svd(near)[2][:, -1]  # of least spread
     return PointCloud(
         jnp.asarray(points), jnp.asarray(normals), jnp.ones(len(points), bool)
     )
