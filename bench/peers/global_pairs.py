@@ -159,6 +159,9 @@ class Features(NamedTuple):
         return Answer(T, min(found.fitness, back.fitness))
 
 
+_KISS_VOXEL = 0.3
+
+
 class Kiss(NamedTuple):
     """KISS-Matcher: faster features, pruning by a graph of consistent pairs, and GNC.
 
@@ -177,16 +180,19 @@ class Kiss(NamedTuple):
         cloud = lib.voxelgrid_sampling(points.astype(np.float64), self.voxel, 1)
         tree = lib.KdTree(cloud, 1)
         lib.estimate_normals(cloud, tree, 10, 1)
-        return list(points.astype(np.float32)), cloud, tree
+        # It refuses small voxels: points in the unit in which they are its default.
+        scaled = (_KISS_VOXEL / self.voxel * points).astype(np.float32)
+        return list(scaled), cloud, tree
 
     def solve(self, source: Any, target: Any, seed: int) -> Answer:
         """Coarse, then ICP within 1.5 voxels. It draws nothing: `seed` is not used."""
         kiss: Any = importlib.import_module("kiss_matcher")
         lib: Any = importlib.import_module("small_gicp")
-        matcher = kiss.KISSMatcher(kiss.KISSMatcherConfig(self.voxel))
+        matcher = kiss.KISSMatcher(kiss.KISSMatcherConfig(_KISS_VOXEL))
         found = matcher.estimate(source[0], target[0])
         T, reach = np.eye(4), 1.5 * self.voxel
         T[:3, :3], T[:3, 3] = found.rotation, np.ravel(found.translation)
+        T[:3, 3] *= self.voxel / _KISS_VOXEL
         T = lib.align(
             target[1], source[1], target[2], T, "PLANE_ICP", reach, 1, 30, 2e-3, 1e-5
         ).T_target_source
