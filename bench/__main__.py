@@ -4,7 +4,8 @@ Run: python -m bench [--quick] [--only NAME ...] [--peers LIST] [--out DIR] [--d
      [--resume] [--gate]
 
 Writes OUT/rows.jsonl while it runs, and OUT/REPORT.md with plots in the end. Peers come
-with `pip install '.[bench]'`; one that is missing has a row that says so. --quick is a
+with `pip install '.[bench]'` (probreg, which builds from source and needs six and
+scikit-learn, by hand); one that is missing has a row that says so. --quick is a
 selection on generated data, in about two minutes. --resume goes on where an earlier
 call with the same DIR was interrupted. --gate compares with bench/baseline.jsonl and
 ends with code 1 where accuracy, or time beside a peer of the same run, was lost.

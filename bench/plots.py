@@ -51,7 +51,7 @@ SERIES = {
         "e_rot", "rotation error of the found, degrees", False, True
     ),
     "look_ups": Series("success", "found, %", True, False),
-    "neighbours": Series("queries_per_s", "queries a second", True, True),
+    "neighbours": Series("cpu_ms", "CPU time of all queries, ms", True, True),
     "averaging_outliers": Series("success", "right, %", False, False),
     "large_graphs": Series("cpu_ms", "CPU time, ms", True, True),
 }

@@ -34,12 +34,13 @@ table are called in turn, in an order that changes, on the same inputs. CPU time
 of all threads of a call, the median over all calls (never fewer than five) with its
 quartiles in brackets. `first call` is wall time of the first call, with compilation for
 JAX (no compilation cache); `prepare` what is built once for all trials, compiled
-before. `memory` is how far one call lifts the resident set. `x` is CPU time over that
-of the table's reference in the same run (wall time where work is in other processes).
-`data` and parameters are written out; lengths that end in "of extent" are shares of the
-diagonal of the bounding box. A peer that is not installed or fails has a row that says
-so. Rows of `--quick` are for the gate: generated data, as many workloads at a time as
-there are cores.
+before. Where wall time is far above CPU time, the machine had other work. `memory` is
+how far one call lifts the resident set. `x` is CPU time over that of the table's
+reference in the same run (wall time where work is in other processes). `data` and
+parameters are written out; lengths that end in "of extent" are shares of the diagonal
+of the bounding box. A peer that is not installed or fails has a row that says so. Rows
+of `--quick` are for the gate: generated data, as many workloads at a time as there are
+cores.
 """
 
 
@@ -104,8 +105,8 @@ def _section(section: Section, pictures: list[Path]) -> Iterator[str]:
     for case, rows in by_case:
         yield from _table(case, list(rows))
     yield "<details><summary>Parameters</summary>\n"
-    told = {r.key.method: r.parameters for r in section.rows if r.parameters}
-    yield from (f"* {name}: `{text}`" for name, text in told.items())
+    told = dict.fromkeys((r.key.method, r.parameters) for r in section.rows)
+    yield from (f"* {name}: `{text}`" for name, text in told if text)
     yield "\n</details>\n"
 
 

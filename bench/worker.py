@@ -30,6 +30,7 @@ def main(task: dict[str, Any]) -> None:
     if not task["resume"]:
         done = {k: r for k, r in done.items() if r.run == task["run"]}
     mode = "quick" if task["quick"] else "full"
+    case = None
     for case in module.cases(Options(task["quick"], Path(task["data"]))):
         case = _on_accelerators(case)
         blank = blank_row(
@@ -49,6 +50,8 @@ def main(task: dict[str, Any]) -> None:
             records.append(path, records.to_line(row))
             print(f"{task['workload']:18.18s} {summary(row)}", flush=True)
     running.unlink(missing_ok=True)
+    if case is None:
+        print(f"{task['workload']:18.18s} no data in {task['data']}: nothing measured")
 
 
 def wanted(case: Case, peers: list[str] | None, done: dict[Key, Row], blank: Any):

@@ -174,6 +174,15 @@ def test_peers_that_are_not_asked_for_have_no_row(fake):
     assert {k.method for k in records.read(path).rows} == {"ours"}
 
 
+def test_a_workload_without_its_data_says_so(fake, monkeypatch, capsys):
+    _, task, path = fake
+    module = sys.modules["bench.workloads.fake"]
+    monkeypatch.setitem(module.__dict__, "cases", lambda options: iter(()))
+    worker.main(task)
+    assert f"no data in {task['data']}" in capsys.readouterr().out
+    assert not path.exists()
+
+
 def test_a_process_that_dies_or_hangs_is_told(tmp_path: Path):
     running = tmp_path / "running.json"
     dies = [sys.executable, "-c", "import os; os._exit(3)"]
