@@ -15,7 +15,7 @@ from jaxreg.plot.figure import figure_module
 # Colours that people who confuse red and green tell apart; the first for jaxreg.
 _COLORS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000",
-    "#999933", "#882255", "#44aa99",
+    "#999933", "#882255", "#44aa99", "#661100",
 )  # fmt: skip
 
 
