@@ -1,0 +1,91 @@
+"""How two surfaces are scored at a pose, and whether they can slip."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import blob
+
+from jaxreg.cloud import PointCloud
+from jaxreg.local import Problem, Score, can_slip, mutual_overlap, score
+from jaxreg.neighbours import BruteForce
+
+
+SPACING = 0.1
+EYE = jnp.eye(4)
+
+
+def _cloud(points: np.ndarray, normals: np.ndarray) -> PointCloud:
+    points, normals = (jnp.asarray(x, jnp.float32) for x in (points, normals))
+    return PointCloud(points, normals, jnp.ones(len(points), bool))
+
+
+def _problem(source: PointCloud, target: PointCloud) -> Problem:
+    return Problem.of(source, target, BruteForce.build(target.points, target.mask))
+
+
+def _floor(height: float, shift: float = 0.0) -> np.ndarray:
+    """16 x 16 points a spacing apart, moved up and along x."""
+    x, y = np.meshgrid(np.arange(16), np.arange(16))
+    points = SPACING * np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    return points + [shift, 0.03, height]
+
+
+UP = np.tile([0.0, 0.0, 1.0], (256, 1))
+
+
+def _score(source: np.ndarray, normals: np.ndarray = UP) -> Score:
+    problem = _problem(_cloud(source, normals), _cloud(_floor(0), UP))
+    return score(problem, EYE, jnp.float32(SPACING))
+
+
+@pytest.mark.parametrize(
+    ("height", "agree", "conflict"),
+    [(0, 256, 0), (0.01, 256, 0), (0.03, 0, 0), (0.1, 0, 256), (0.25, 0, 256)],
+)
+def test_points_agree_on_a_surface_and_conflict_over_or_under_it(
+    height, agree, conflict
+):
+    for side in (-1, 1):
+        found = _score(_floor(side * height))
+        assert int(found.num_inliers) == agree
+        assert int(found.num_conflicts) == conflict
+        assert float(found.fitness) == pytest.approx(agree / 256)
+
+
+def test_points_far_over_or_beyond_a_surface_do_not_conflict_with_it():
+    assert int(_score(_floor(0.4)).num_conflicts) == 0
+    half_beyond = _score(_floor(0.1, shift=8 * SPACING))
+    assert int(half_beyond.num_conflicts) == 8 * 16
+    across = np.tile([1.0, 0.0, 0.0], (256, 1))
+    assert int(_score(_floor(0.1), across).num_conflicts) == 0
+
+
+def test_conflicts_lessen_the_overlap():
+    source = np.concatenate([_floor(0)[:128], _floor(0.1)[128:]])
+    found = _score(source)
+    assert float(found.consistency) == 0.5
+    assert float(mutual_overlap(found, found)) == pytest.approx(0.5 * 0.5**2)
+    none = _score(_floor(1.0))
+    assert float(mutual_overlap(none, none)) == 0
+
+
+def _slips(points: np.ndarray, normals: np.ndarray) -> bool:
+    cloud = _cloud(points, normals)
+    return bool(can_slip(_problem(cloud, cloud), EYE, jnp.float32(SPACING)))
+
+
+def test_surfaces_that_move_in_themselves_slip():
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((400, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    assert _slips(x, x)  # a sphere
+    ring = x * [1, 1, 0] / np.linalg.norm(x[:, :2], axis=1, keepdims=True)
+    assert _slips(ring + x * [0, 0, 1], ring)  # a cylinder
+    assert _slips(_floor(0), UP)
+    cube = np.where(np.abs(x) == np.abs(x).max(1, keepdims=True), np.sign(x), 0)
+    assert not _slips(cube + x * (cube == 0), cube)
+
+
+def test_points_without_normals_hold_a_pose():
+    points = blob(400, 3)
+    assert not _slips(points, np.zeros_like(points))
