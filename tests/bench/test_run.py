@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import jax
 import numpy as np
 import pytest
 
@@ -172,6 +173,24 @@ def test_peers_that_are_not_asked_for_have_no_row(fake):
     state["broken"] = False
     worker.main(task | {"peers": []})
     assert {k.method for k in records.read(path).rows} == {"ours"}
+
+
+def test_an_accelerator_adds_a_row_of_what_can_be_put_there(monkeypatch):
+    cpu = jax.devices("cpu")
+    monkeypatch.setattr(jax, "devices", lambda kind: cpu)
+
+    def solve(x: float) -> float:
+        return float(jax.numpy.asarray(x))
+
+    method = Method("batch", "jaxreg", "", solve, on_accelerator=True)
+    try:
+        case = worker._on_accelerators(_case(method, _method("single", solve)))
+    finally:
+        jax.config.update("jax_default_device", None)
+    names = [m.name for m in case.methods]
+    assert names == ["batch", "single", f"batch, {cpu[0].device_kind}"]
+    rows = measure(case, list(case.methods), BLANK)
+    assert [row.value("sum") for row in rows] == [10.0] * 3
 
 
 def test_a_workload_without_its_data_says_so(fake, monkeypatch, capsys):
