@@ -78,6 +78,9 @@ def judge(data: ScanPairs, answers: list[Any]) -> Judged:
     """Right pairs by their overlap at the truth, and beliefs that are wrong."""
     right = np.array([data.correct(k, T) for k, (T, _, _) in enumerate(answers)])
     believed = np.array([b for _, _, b in answers])
+    score = np.array([s for _, s, _ in answers])
+    # What a user could believe without an error, by whatever threshold is best.
+    above = float((score[right] > score[~right].max(initial=0)).sum())
     both = np.array([data.errors(k, T) for k, (T, _, _) in enumerate(answers)])
     metrics = []
     for band, (low, high) in BANDS.items():
@@ -85,6 +88,7 @@ def judge(data: ScanPairs, answers: list[Any]) -> Judged:
         slack = 100 * max(1.0, 0.05 * here.sum()) / here.sum() + 1e-6
         metrics.append(share(f"right, overlap {band}", right[here], slack))
     metrics += [
+        Metric("right above any wrong", above, "pairs", "up", 3.0),
         Metric("believed", float(believed.sum()), "pairs", "up", 3.0),
         Metric(
             "believed wrongly", float((believed & ~right).sum()), "pairs", "down", 1.0
