@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxreg.averaging.base import length_scale
 from jaxreg.averaging.evidence import prior_odds
+from jaxreg.averaging.laplacian import DENSE_LIMIT
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -28,12 +29,21 @@ CYCLE_LIMIT = 1_000_000
 _PRIOR, _POWER, _LEAST, _CAP, _ROUNDS = 0.4, 4, 0.3, 1e4, 6
 #: Closing errors, in radians and length scales, that speak neither for nor against.
 NEUTRAL = (0.2, 0.1, 0.05, 0.025)
+# Edges over frames below which graphs of more than `DENSE_LIMIT` frames have too few
+# cycles of three to judge by.
+_LOOPS = 2
 # Ratios whose product neither overflows nor underflows in float32.
 _TOGETHER = 8
 
 
 def judged(graph: PoseGraph) -> bool:
-    """Whether the graph is small enough for `edge_log_odds` to look at its cycles."""
+    """Whether `edge_log_odds` looks at the cycles of a graph.
+
+    If it is small, or of moderate size and not nearly a tree.
+    """
+    sparse = graph.num_edges < _LOOPS * graph.num_poses
+    if sparse and graph.num_poses > DENSE_LIMIT:
+        return False
     return graph.num_edges * graph.num_poses <= CYCLE_LIMIT
 
 

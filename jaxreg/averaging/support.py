@@ -16,9 +16,9 @@ from jaxreg.graph.pose_graph import PoseGraph, product
 # is compared with so many that follow it in their order; errors of agreement, radians
 # and length scales.
 _NEAR, _COMPARED, _AGREES = 8, 3, 0.3
-# What others count that hold a frame, and the share of confirmed closures below which
-# all count.
-_DOUBTED, _USUAL = 1e-3, 0.25
+# What others count that hold a frame; the shares of confirmed closures, and of frames
+# measured from the one before, below which all count.
+_DOUBTED, _USUAL, _SEQUENCE = 1e-3, 0.25, 0.5
 
 
 def without_lone_closures(graph: PoseGraph) -> PoseGraph:
@@ -34,6 +34,8 @@ def without_lone_closures(graph: PoseGraph) -> PoseGraph:
     closure = (graph.weight > 0) & ~successive
     supported = confirmed(graph, closure)
     usual = jnp.sum(supported) >= _USUAL * jnp.sum(closure)
+    steps = jnp.sum((graph.weight > 0) & successive)
+    usual = usual & (steps >= _SEQUENCE * (graph.num_poses - 1))
     doubted = closure & ~supported & usual
     weight = jnp.where(doubted, _DOUBTED * graph.weight, graph.weight)
     tree = trees.maximum_spanning_tree(

@@ -71,6 +71,16 @@ def test_where_no_closure_is_confirmed_all_keep_their_weight():
     np.testing.assert_array_equal(weight, graph.weight)
 
 
+def test_where_the_numbers_of_frames_tell_no_order_all_keep_their_weight():
+    again = np.stack([np.arange(LAP), LAP + np.arange(LAP)], axis=1)
+    closures = np.concatenate([again, [[3, 25], [12, 51]]])
+    graph, _ = two_laps(closures, np.arange(len(closures)) >= LAP)
+    name = np.random.default_rng(0).permutation(NUM).astype(np.int32)
+    named = eqx.tree_at(lambda g: g.edges, graph, jnp.asarray(name)[graph.edges])
+    weight = without_lone_closures(named).weight
+    np.testing.assert_array_equal(weight, graph.weight)
+
+
 def test_a_chain_without_closures_keeps_its_weights():
     graph, _ = two_laps(np.tile([0, LAP], (LAP + 2, 1)), np.zeros(LAP + 2, bool))
     chain = np.arange(graph.num_edges) < NUM - 1
