@@ -180,11 +180,12 @@ class Correntropy(AbstractAverager):
         return gauss_newton_gradients(graph, end, gaussian_trust)
 
     def _from_width(self, graph: PoseGraph, T_start: Array, width: Array) -> Iterated:
+        scale = length_scale(graph)
         return iterate(
             graph,
             T_start,
             width,
-            annealed_width,
+            lambda g, T, w: annealed_width(g, T, w, scale),
             gaussian_trust,
             gauss_newton_step,
             max_steps=self.max_steps,

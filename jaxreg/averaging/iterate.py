@@ -9,11 +9,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.averaging.base import length_scale
 from jaxreg.averaging.implicit import differentiable
-from jaxreg.averaging.laplacian import divergence, flow_solver
+from jaxreg.averaging.laplacian import divergence, solve_flow
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 
 
+#: Relative tolerance of a step's system: each step takes up what the last one left.
+STEP_TOLERANCE = 1e-4
 #: Kernel widths `(2,)` (length, radians) at given poses, from the widths before.
 WidthOf = Callable[[PoseGraph, Array, Array], Array]
 #: Trust of each edge `(e,)` at given poses and widths.
@@ -57,23 +59,20 @@ def averaging_step(rows_of: RowsOf) -> Step:
     """
 
     def step(graph: PoseGraph, T: Array, trust: Array, width: Array) -> Array:
-        return averaged(graph, T, step_solver(graph, rows_of(graph, trust)))
+        weight, num = rows_of(graph, trust), graph.num_poses
+
+        def solve(flow: Array) -> Array:
+            return solve_flow(graph.edges, weight, flow, num, STEP_TOLERANCE)
+
+        return averaged(graph, T, solve)
 
     return step
-
-
-def step_solver(
-    graph: PoseGraph, weight: Float[Array, " e"]
-) -> Callable[[Float[Array, "e k"]], Float[Array, "v k"]]:
-    """The tangents of a step from the logarithms of residual motions."""
-    # Each step takes up what the last one left.
-    return flow_solver(graph.edges, weight, graph.num_poses, 1e-4)
 
 
 def averaged(
     graph: PoseGraph, T: Float[Array, "v D D"], solve: Callable[[Array], Array]
 ) -> Float[Array, "v D D"]:
-    """The poses after one step of motion averaging, by `step_solver`."""
+    """The poses after one step; `solve` finds tangents from logarithms (Eq. 20)."""
     tangent = solve(lie.log(graph.residual_motions(T)))
     return nearby_rotation(product(lie.exp(tangent), T))
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxreg.averaging.krylov import conjugate_gradients
-from jaxreg.averaging.multigrid import Laplacian, Multigrid, anchored, multigrid
+from jaxreg.averaging.multigrid import anchored, multigrid, ridged_inverse
 
 
 #: Largest number of frames for which a dense matrix over frames is formed.
@@ -41,21 +41,36 @@ def solve_flow(
     Frames that no weight holds stay at 0 (the solution of least norm). Graphs above
     `DENSE_LIMIT` are solved to a relative `tolerance`, at best that of the dtype.
     """
-    return flow_solver(edges, weight, num_poses, tolerance)(flow)
+    w = _relative(weight)
+    rhs = divergence(edges, w[:, None] * flow, num_poses)
+    return solve_laplacian(edges, w, rhs, tolerance)
 
 
 def flow_solver(
     edges: Int[Array, "e 2"],
     weight: Float[Array, " e"],
     num_poses: int,
-    tolerance: float = 0.0,
+    tolerance: float,
 ) -> Callable[[Float[Array, "e k"]], Float[Array, "v k"]]:
-    """`solve_flow` for many flows under the same weights, prepared once."""
-    # The weights are relative: no power of them can underflow the whole system.
-    top = jnp.max(weight)
-    w = weight / jnp.where(top > 0, top, 1)
-    solve = _solver(edges, w, num_poses, tolerance)
+    """`solve_flow` for many flows under the same weights, prepared once.
+
+    Every frame must be joined to frame 0 or have no weight at all.
+    """
+    w = _relative(weight)
+    if num_poses <= DENSE_LIMIT:
+        inverse = ridged_inverse(laplacian(edges, w, num_poses))
+
+        def solve(rhs: Array) -> Array:
+            return inverse @ rhs.at[0].set(0)
+    else:
+        solve = _iterative(edges, w, num_poses, tolerance)
     return lambda flow: solve(divergence(edges, w[:, None] * flow, num_poses))
+
+
+def _relative(weight: Array) -> Array:
+    """Weights of at most 1: no power of them can underflow the whole system."""
+    top = jnp.max(weight)
+    return weight / jnp.where(top > 0, top, 1)
 
 
 def solve_laplacian(
@@ -65,18 +80,33 @@ def solve_laplacian(
     tolerance: float = 0.0,
 ) -> Float[Array, "v k"]:
     """The x with x_0 = 0 and B' W B x = rhs but for row 0; weights of at most 1."""
-    return _solver(edges, weight, rhs.shape[0], tolerance)(rhs)
+    num = rhs.shape[0]
+    if num <= DENSE_LIMIT:
+        return jnp.linalg.lstsq(laplacian(edges, weight, num), rhs.at[0].set(0))[0]
+    return _iterative(edges, weight, num, tolerance)(rhs)
 
 
-def _solver(
+def _iterative(
     edges: Array, weight: Array, num_poses: int, tolerance: float
 ) -> Callable[[Array], Array]:
-    if num_poses <= DENSE_LIMIT:
-        L = laplacian(edges, weight, num_poses)
-        return lambda rhs: jnp.linalg.lstsq(L, rhs.at[0].set(0))[0]
+    """Preconditioned conjugate gradients, the k columns side by side."""
     matrix = anchored(edges, weight[:, None, None], num_poses)
     inverse = multigrid(matrix)
-    return lambda rhs: _conjugate_gradients(matrix, inverse, rhs, tolerance)
+    least = 3 * float(jnp.finfo(weight.dtype).eps)
+
+    def solve(rhs: Array) -> Array:
+        # What arrives at frame 0 leaves the others.
+        rhs = rhs.at[0].set(-jnp.sum(rhs[1:], axis=0))
+        x = conjugate_gradients(
+            matrix,
+            inverse,
+            rhs[:, None, :],
+            tolerance=max(tolerance, least),
+            max_steps=500,
+        )[0][:, 0]
+        return x.at[0].set(0)
+
+    return solve
 
 
 def laplacian(
@@ -88,19 +118,3 @@ def laplacian(
     L = L.at[i, i].add(weight).at[j, j].add(weight)
     L = L.at[i, j].add(-weight).at[j, i].add(-weight)
     return L.at[0].set(0).at[:, 0].set(0).at[0, 0].set(1)
-
-
-def _conjugate_gradients(
-    matrix: Laplacian, inverse: Multigrid, rhs: Array, tolerance: float
-) -> Array:
-    """Preconditioned conjugate gradients, the k columns side by side."""
-    # What arrives at frame 0 leaves the others.
-    rhs = rhs.at[0].set(-jnp.sum(rhs[1:], axis=0))
-    x = conjugate_gradients(
-        matrix,
-        inverse,
-        rhs[:, None, :],
-        tolerance=max(tolerance, 3 * float(jnp.finfo(rhs.dtype).eps)),
-        max_steps=500,
-    )[0][:, 0]
-    return x.at[0].set(0)

@@ -15,13 +15,14 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
 from jaxreg.averaging.iterate import (
+    STEP_TOLERANCE,
     Iterated,
     RowsOf,
     averaged,
     averaging_gradients,
     iterate,
-    step_solver,
 )
+from jaxreg.averaging.laplacian import flow_solver
 from jaxreg.averaging.tree import SpanningTree, start
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -133,7 +134,8 @@ def iterate_plain(
 ) -> Iterated:
     """Averaging in which every edge is trusted; no gradients."""
     graph = jax.lax.stop_gradient(graph)
-    solve = step_solver(graph, rows(graph, jnp.ones_like(graph.weight)))
+    weight = rows(graph, jnp.ones_like(graph.weight))
+    solve = flow_solver(graph.edges, weight, graph.num_poses, STEP_TOLERANCE)
 
     def same_width(g: PoseGraph, T: Array, width: Array) -> Array:
         return width

@@ -43,13 +43,17 @@ def first_width(
 
 
 def annealed_width(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"], width: Float[Array, "2"]
+    graph: PoseGraph,
+    T_world_i: Float[Array, "v D D"],
+    width: Float[Array, "2"],
+    scale: Float[Array, ""],
 ) -> Float[Array, "2"]:
     """The next width: three deviations of the edges inside the present one.
 
     Never wider than before and at most halved. The weighted mean square v of Gaussian
     noise of variance s^2 under a Gaussian kernel of width w is 1 / (1/s^2 + 1/w^2),
     which is solved for s^2; s^2 is enlarged for the unknowns that the poses take up.
+    `scale` is the `length_scale` of the graph.
     """
     d = graph.dim
     rotation, translation = graph.differences(T_world_i)
@@ -72,10 +76,6 @@ def annealed_width(
         ]
     )
     variance = jnp.maximum(variance, middle) * count / jnp.maximum(spare, 1e-3)
-    floor = (
-        64
-        * jnp.finfo(w.dtype).eps
-        * jnp.stack([length_scale(graph), jnp.ones_like(total)])
-    )
+    floor = 64 * jnp.finfo(w.dtype).eps * jnp.stack([scale, jnp.ones_like(total)])
     target = jnp.maximum(_DEVIATIONS * jnp.sqrt(variance), floor)
     return jnp.clip(target, _NARROWEST_STEP * width, width)
