@@ -58,10 +58,7 @@ def flow_solver(
     """
     w = _relative(weight)
     if num_poses <= DENSE_LIMIT:
-        inverse = ridged_inverse(laplacian(edges, w, num_poses))
-
-        def solve(rhs: Array) -> Array:
-            return inverse @ rhs.at[0].set(0)
+        solve = _direct(edges, w, num_poses)
     else:
         solve = _iterative(edges, w, num_poses, tolerance)
     return lambda flow: solve(divergence(edges, w[:, None] * flow, num_poses))
@@ -84,6 +81,11 @@ def solve_laplacian(
     if num <= DENSE_LIMIT:
         return jnp.linalg.lstsq(laplacian(edges, weight, num), rhs.at[0].set(0))[0]
     return _iterative(edges, weight, num, tolerance)(rhs)
+
+
+def _direct(edges: Array, weight: Array, num_poses: int) -> Callable[[Array], Array]:
+    inverse = ridged_inverse(laplacian(edges, weight, num_poses))
+    return lambda rhs: inverse @ rhs.at[0].set(0)
 
 
 def _iterative(
