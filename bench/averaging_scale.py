@@ -128,7 +128,8 @@ def batch(num: int, side_by_side: bool, seed: int) -> None:
     right = np.mean((np.rad2deg(e_R) < 5) & (np.asarray(e_t) < 0.05))
     print(
         f"{num} graphs of {N}:{H}: {num / seconds:.0f} graphs/s, call {seconds:.2f} s "
-        f"(CPU {cpu:.2f}), first {first:.1f} s, right {right:.3f}, memory {memory():.2f} GB"
+        f"(CPU {cpu:.2f}), first {first:.1f} s, right {right:.3f}, "
+        f"memory {memory():.2f} GB"
     )
 
 
