@@ -15,8 +15,8 @@ EYE = jnp.eye(4)
 
 
 def _cloud(points: np.ndarray, normals: np.ndarray) -> PointCloud:
-    points, normals = (jnp.asarray(x, jnp.float32) for x in (points, normals))
-    return PointCloud(points, normals, jnp.ones(len(points), bool))
+    both = (jnp.asarray(x, jnp.float32) for x in (points, normals))
+    return PointCloud(*both, jnp.ones(len(points), bool))
 
 
 def _problem(source: PointCloud, target: PointCloud) -> Problem:
