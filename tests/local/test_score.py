@@ -15,8 +15,11 @@ EYE = jnp.eye(4)
 
 
 def _cloud(points: np.ndarray, normals: np.ndarray) -> PointCloud:
-    both = (jnp.asarray(x, jnp.float32) for x in (points, normals))
-    return PointCloud(*both, jnp.ones(len(points), bool))
+    return PointCloud(
+        jnp.asarray(points, jnp.float32),
+        jnp.asarray(normals, jnp.float32),
+        jnp.ones(len(points), bool),
+    )
 
 
 def _problem(source: PointCloud, target: PointCloud) -> Problem:
