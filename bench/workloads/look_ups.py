@@ -6,11 +6,17 @@ All methods have the same parts; a budget scales how many poses they draw and ca
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
-from bench.case import Case, Options
+import numpy as np
+
+from bench.case import Case, Judged, Method, Options, Solve
 from bench.particle_data import horse_model
-from bench.workloads.global_data import half, so3
+from bench.records import share
+from bench.workloads.global_data import SCAN_SETS, ScanPairs, half, scan_pairs, so3
 from bench.workloads.global_horse import PREPARED, judge, prepared
+from bench.workloads.local_pairs import written_out
+from bench.workloads.prepared_scans import Own
 from jaxreg.particle import (
     AbstractSearch,
     ConstantVelocity,
@@ -22,10 +28,22 @@ from jaxreg.particle import (
 
 BUDGETS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)
 TRIALS = 100
+#: Of real scans, every pair that overlaps by so much is searched.
+SCAN_BUDGETS = (1 / 8, 1 / 4, 1 / 2, 1)
+LEAST_OVERLAP = 0.1
 
 
 def cases(options: Options) -> Iterator[Case]:
-    """A case per kind of horse and budget."""
+    """A case per kind of horse, or pairs of scans where there are, and budget."""
+    yield from _horses(options)
+    sets = [
+        scan_pairs(options.data, x) for x in SCAN_SETS if (options.data / x).is_dir()
+    ]
+    if sets:
+        yield from _scans(sets)
+
+
+def _horses(options: Options) -> Iterator[Case]:
     folder = options.data / "horse"
     model = horse_model(folder)
     scanned = (folder / "horse.ply.gz").is_file()
@@ -48,6 +66,54 @@ def cases(options: Options) -> Iterator[Case]:
                 x=count,
                 x_label=f"closest points looked up, {title}",
             )
+
+
+def _scans(sets: list[ScanPairs]) -> Iterator[Case]:
+    title = f"pairs of scans, overlap {LEAST_OVERLAP:g} and more"
+    pairs = [
+        (number, pair)
+        for number, data in enumerate(sets)
+        for pair in np.flatnonzero(data.overlap >= LEAST_OVERLAP).tolist()
+    ]
+    right = partial(_judge_scans, sets, pairs)
+    for budget in SCAN_BUDGETS:
+        found = searches(ParticleFilter(), budget)
+        ours = found["jaxreg filter"]
+        assert isinstance(ours, ParticleFilter)
+        count = ours.most_look_ups * ours.num_points
+        yield Case(
+            name=f"{title}, {count / 1e6:.3f} M",
+            data=", ".join(data.name for data in sets),
+            methods=[
+                Method(n, "jaxreg", written_out(s), prepare=partial(_between, s, sets))
+                for n, s in found.items()
+            ],
+            trials=pairs,
+            judge=right,
+            x=count,
+            x_label=f"closest points looked up, {title}",
+        )
+
+
+def _between(search: AbstractSearch, sets: list[ScanPairs]) -> Solve:
+    """Scans prepared, and the search between two of a set."""
+    own = [Own(search, data) for data in sets]
+
+    def solve(number: int, pair: int) -> np.ndarray:
+        target, source = sets[number].pairs[pair].tolist()
+        return own[number].solve(source, target, pair)[0]
+
+    return solve
+
+
+def _judge_scans(
+    sets: list[ScanPairs], pairs: list[tuple[int, int]], answers: list[Any]
+) -> Judged:
+    right = [
+        sets[number].correct(pair, T)
+        for (number, pair), T in zip(pairs, answers, strict=True)
+    ]
+    return Judged([share("success", np.array(right), 5.0)], {})
 
 
 def searches(base: ParticleFilter, budget: float) -> dict[str, AbstractSearch]:
