@@ -101,6 +101,12 @@ def _series(series: Series, rows: list[Row], path: Path) -> Path | None:
                 low, high = zip(*(p[1].spread for p in points), strict=True)
                 axis.fill_between(x, low, high, color=style["color"], alpha=0.12, lw=0)
         axis.set_xscale("log" if series.log_x else "linear")
+        if series.log_x:
+            # At what was measured: labels between powers of ten collide.
+            ticks = sorted({r.x for r in rows if r.x_label == label and r.x})
+            axis.set_xticks(ticks, [f"{tick:,.10g}" for tick in ticks])
+            axis.tick_params(axis="x", labelsize=7, rotation=30)
+            axis.minorticks_off()
         axis.set_yscale("log" if series.log_y else "linear")
         axis.set_xlabel(label, fontsize=9)
         axis.set_ylabel(series.label, fontsize=9)
