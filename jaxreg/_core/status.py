@@ -50,8 +50,9 @@ _ADVICE = {
         "overlap; else raise the number of particles or give an initial guess."
     ),
     Status.AMBIGUOUS: (
-        "Several poses agree about equally well (a symmetric object?). See the modes "
-        "of the solution, or give an initial guess."
+        "Several poses agree about equally well (a symmetric object?), or surfaces "
+        "that agree can slip along each other. See the modes of the solution, or give "
+        "an initial guess."
     ),
     Status.DIVERGED: (
         "The steps led to a worse pose than the initial guess, which is returned. "

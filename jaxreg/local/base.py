@@ -99,7 +99,8 @@ class RegistrationSolution(eqx.Module):
             planes, in the unit of the input.
         num_inliers: int32, points of the (thinned) source in that share.
         overlap: geometric mean of the shares of source and target that lie on the
-            other, at most twice the lesser.
+            other, at most twice the lesser, times the consistencies: of the points
+            on, over or under the other surface, the share that lies on it.
         num_steps: int32, steps of the local optimiser along the winning path.
         H: `(k, k)` Gauss-Newton matrix of the weighted energy of the last step, for a
             tangent (v, w), translation first: R -> exp(w) R, c -> c + v, where c is

@@ -97,8 +97,9 @@ class ParticleFilter(AbstractSearch):
     Raises: ValueError while constructing, for counts that leave nothing to do.
 
     Fails: TOO_FEW_POINTS; NON_FINITE where no energy is finite; LOW_OVERLAP where the
-    overlap is below `min_overlap`; AMBIGUOUS where a second mode is nearly as good;
-    without refinement MAX_STEPS where the diffusion had not died.
+    overlap is below `min_overlap`; AMBIGUOUS where a second mode is nearly as good,
+    or where the surfaces that agree can slip, as those of a cylinder; without
+    refinement MAX_STEPS where the diffusion had not died.
 
     Gradients: none; refine with `ICP` from the answer to differentiate it.
     """
