@@ -103,9 +103,9 @@ def mutual_overlap(there: Score, back: Score) -> Float[Array, "*q"]:
     right poses from wrong ones better than the lesser of the two. But at most twice the
     lesser, as nearly everything fits a small patch of a smooth surface. Times the
     consistencies: where two scans show the same place they show it at the same height,
-    while surfaces that touch by chance part again. (Scans of an object have a
-    consistency of 0.95 and more, of a cluttered room 0.8; smooth surfaces laid on each
-    other wrongly 0.3 to 0.7.)
+    while surfaces that touch by chance part again. (Right pairs of scans of an
+    object mostly have a consistency above 0.85, of a cluttered room 0.8; smooth
+    surfaces laid on each other wrongly 0.3 to 0.7.)
     """
     least = jnp.minimum(there.fitness, back.fitness)
     share = jnp.minimum(jnp.sqrt(there.fitness * back.fitness), 2 * least)

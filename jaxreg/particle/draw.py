@@ -81,7 +81,7 @@ def draw_until_sure(
     Args:
         problem: the pair.
         optimiser: residual x kernel x step.
-        energy: bounded by zero and one.
+        energy: bounded, see `BoundedEnergy`.
         T: `(p, d+1, d+1)` poses of the prior, of which the first `num` count.
         widths: kernel width of the measurement, and at the end of settling.
         num: poses to draw at most.
