@@ -89,7 +89,7 @@ class CycleConsensus(AbstractAverager):
         start = _Search(
             T=T[best],
             score=score[best],
-            settled=_is_settled(graph, own, T[best], scale),
+            settled=_is_settled(graph, odds, T[best], scale),
             idle=jnp.asarray(0, jnp.int32),
             round=jnp.asarray(0, jnp.int32),
             key=jax.random.key(0) if key is None else key,
@@ -188,10 +188,17 @@ def _holds(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
 
 
 def _is_settled(graph: PoseGraph, odds: Array, T: Array, scale: Array) -> Array:
-    """True if believed edges reach every frame and hardly any contradicts the poses."""
-    believed = jnp.where(odds > 0, 1, 0).astype(odds.dtype)
-    component = trees.components(graph.edges, believed, graph.num_poses)
+    """True if believed edges reach every frame and hardly any contradicts the poses.
+
+    The edges believed at any one scale: noise may leave few at the finest.
+    """
     placed = trees.components(graph.edges, graph.weight, graph.num_poses) == 0
-    reached = jnp.all((component == 0) | ~placed)
-    doubtful = jnp.sum(believed * (_holds(graph, T, scale) < 0.5))
-    return reached & (doubtful <= 0.02 * jnp.sum(believed))
+    contradicted = _holds(graph, T, scale) < 0.5
+
+    def at_scale(odds: Array) -> Array:
+        believed = jnp.where(odds > 0, 1, 0).astype(odds.dtype)
+        component = trees.components(graph.edges, believed, graph.num_poses)
+        reached = jnp.all((component == 0) | ~placed)
+        return reached & (jnp.sum(believed * contradicted) <= 0.02 * jnp.sum(believed))
+
+    return jnp.any(jax.vmap(at_scale)(odds))
