@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.checks import as_float_array
+from jaxreg._core.compile import compiled
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
@@ -66,7 +67,7 @@ def average(
     return _average(graph, method, init, key)
 
 
-@eqx.filter_jit
+@compiled
 def _average(
     graph: PoseGraph,
     method: AbstractAverager,

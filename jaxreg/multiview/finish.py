@@ -1,9 +1,9 @@
 """From the motions of pairs to the answer: poses, statuses, trust."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core.compile import compiled
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
@@ -37,7 +37,7 @@ def finish(
     return _solution(scans, motions, placement, min_overlap)
 
 
-@eqx.filter_jit
+@compiled
 def _solution(
     scans: PreparedScans,
     motions: RelativeMotions,

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Scalar, StatusArray
 from jaxreg.averaging import (
     AbstractAverager,
@@ -41,7 +42,7 @@ class Placement(eqx.Module):
     status: StatusArray
 
 
-@eqx.filter_jit
+@compiled
 def place(
     motions: RelativeMotions,
     num_scans: int,

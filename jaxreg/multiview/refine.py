@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from jaxreg._core.arrays import cast_floats
+from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import AbstractAverager, Correntropy, SpanningTree
 from jaxreg.geometry import lie
@@ -65,7 +66,7 @@ def refine(
     return placement
 
 
-@eqx.filter_jit
+@compiled
 def _updated(before: Placement, after: Placement) -> Placement:
     """The later poses of the scans that both hold, in the earlier frame."""
     held = before.placed & after.placed
@@ -76,7 +77,7 @@ def _updated(before: Placement, after: Placement) -> Placement:
     return eqx.tree_at(lambda p: (p.T_world_i, p.placed), before, (T, held))
 
 
-@eqx.filter_jit
+@compiled
 def _measured(
     scans: PreparedScans, placement: Placement, min_overlap: Scalar, *, exact: bool
 ) -> RelativeMotions:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxreg._core.checks import as_float_array, check_motion, check_pair
+from jaxreg._core.compile import compiled
 from jaxreg.geometry import lie
 from jaxreg.neighbours.auto import exact_index
 from jaxreg.neighbours.base import Neighbours
@@ -58,7 +59,7 @@ def correspondences(
     return _find(source, target, T, max_distance, source_mask, target_mask)
 
 
-@eqx.filter_jit
+@compiled
 def _find(
     source: Array,
     target: Array,
