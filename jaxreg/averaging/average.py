@@ -1,5 +1,7 @@
 """`average`: one pose per frame from relative motions."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -64,40 +66,48 @@ def average(
             raise ValueError(
                 f"init: wanted shape {(graph.num_poses, D, D)}, found {init.shape}."
             )
-    return _average(graph, method, init, key)
+    reduced, method, T_start, gauge = _prepared(graph, method, init)
+    return _placed(method.solve(reduced, T_start, key), gauge)
+
+
+class _Gauge(NamedTuple):
+    T_world_0: Array
+    component: Array
+    finite: Array
 
 
 @compiled
-def _average(
-    graph: PoseGraph,
-    method: AbstractAverager,
-    init: Float[Array, "v D D"] | None,
-    key: Key | None,
-) -> AveragingSolution:
+def _prepared(
+    graph: PoseGraph, method: AbstractAverager, init: Float[Array, "v D D"] | None
+) -> tuple[PoseGraph, AbstractAverager, Float[Array, "v D D"] | None, _Gauge]:
+    """What a method needs: a graph joined to frame 0, which is at the identity."""
     dtype, d = graph.T_i_j.dtype, graph.dim
     method = cast_floats(method, dtype)
     reduced, component, finite = _reduce(graph)
-    placed = component == component[0]
-    T_start = None
-    T_world_0 = jnp.eye(d + 1, dtype=dtype)
+    T_start, T_world_0 = None, jnp.eye(d + 1, dtype=dtype)
     if init is not None:
         sound = jnp.all(jnp.isfinite(init), axis=(1, 2))
         finite = finite & jnp.all(sound)
         init = jnp.where(sound[:, None, None], init, jnp.eye(d + 1, dtype=dtype))
         T_world_0 = init[0]
         T_start = lie.inverse(T_world_0) @ init
-    out = method.solve(reduced, T_start, key)
-    T_0_i, eye = out.T_world_i, jnp.eye(d + 1, dtype=dtype)
+    return reduced, method, T_start, _Gauge(T_world_0, component, finite)
+
+
+@compiled
+def _placed(out: AveragingSolution, gauge: _Gauge) -> AveragingSolution:
+    T_0_i, placed = out.T_world_i, gauge.component == gauge.component[0]
+    eye = jnp.eye(T_0_i.shape[-1], dtype=T_0_i.dtype)
     sound = jnp.all(jnp.isfinite(T_0_i), axis=(1, 2))
-    finite = finite & jnp.all(sound)
-    T_world_i = jnp.where(sound[:, None, None], T_world_0 @ T_0_i, eye)
+    T_world_i = jnp.where(sound[:, None, None], gauge.T_world_0 @ T_0_i, eye)
     T_world_i = jnp.where(placed[:, None, None], T_world_i, eye)
     status = jnp.where(jnp.all(placed), out.status, Status.DISCONNECTED)
+    finite = gauge.finite & jnp.all(sound)
     status = jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)
     return eqx.tree_at(
         lambda s: (s.T_world_i, s.placed, s.component, s.status),
         out,
-        (T_world_i, placed, component, status),
+        (T_world_i, placed, gauge.component, status),
     )
 
 

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core.checks import is_concrete
+from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -75,9 +77,17 @@ class CycleConsensus(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Finds a start for a prepared graph; `edge_weight` is the belief in edges."""
-        graph = jax.lax.stop_gradient(graph)
         if not judged(graph):
-            return solution(graph, _without_cycles(graph), num_steps=0)
+            return _by_trees(graph)
+        found = self._begun(graph, key)
+        # Most graphs are done: the search is compiled for one that is not.
+        if not is_concrete(found.search.settled) or not found.search.settled:
+            found = self._searched(graph, found)
+        return _believed(graph, found)
+
+    @compiled
+    def _begun(self, graph: PoseGraph, key: Key | None) -> "_Found":
+        graph = jax.lax.stop_gradient(graph)
         scale, odds = length_scale(graph), edge_log_odds(graph)
         # Prior weights and short chains are hypotheses of their own.
         weights = jnp.concatenate([odds, graph.weight[None]])
@@ -85,8 +95,7 @@ class CycleConsensus(AbstractAverager):
         T = jnp.concatenate([T, _shortest(graph, odds)[None]])
         score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
         best = jnp.argmax(score)
-        own = odds[jnp.minimum(best, odds.shape[0] - 1)]
-        start = _Search(
+        search = _Search(
             T=T[best],
             score=score[best],
             settled=_is_settled(graph, odds, T[best], scale),
@@ -94,16 +103,21 @@ class CycleConsensus(AbstractAverager):
             round=jnp.asarray(0, jnp.int32),
             key=jax.random.key(0) if key is None else key,
         )
+        own = odds[jnp.minimum(best, odds.shape[0] - 1)]
+        return _Found(search, T, odds, own)
+
+    @compiled
+    def _searched(self, graph: PoseGraph, begun: "_Found") -> "_Found":
+        graph = jax.lax.stop_gradient(graph)
+        scale = length_scale(graph)
 
         def unfinished(s: _Search) -> Array:
             return ~s.settled & (s.round < self.rounds) & (s.idle < _PATIENCE)
 
         def step(s: _Search) -> _Search:
-            return self._round(graph, odds, scale, T, s)
+            return self._round(graph, begun.odds, scale, begun.starts, s)
 
-        end = jax.lax.while_loop(unfinished, step, start)
-        belief = jnp.where(graph.weight > 0, jax.nn.sigmoid(own), 0)
-        return solution(graph, end.T, edge_weight=belief, num_steps=end.round)
+        return begun._replace(search=jax.lax.while_loop(unfinished, step, begun.search))
 
     def _round(
         self, graph: PoseGraph, odds: Array, scale: Array, starts: Array, s: "_Search"
@@ -147,6 +161,27 @@ class _Search(NamedTuple):
     idle: Array  # rounds since the last gain
     round: Array
     key: Array
+
+
+class _Found(NamedTuple):
+    search: _Search
+    starts: Array
+    odds: Array
+    own: Array  # the odds of the scale of the best start
+
+
+@compiled
+def _by_trees(graph: PoseGraph) -> AveragingSolution:
+    graph = jax.lax.stop_gradient(graph)
+    return solution(graph, _without_cycles(graph), num_steps=0)
+
+
+@compiled
+def _believed(graph: PoseGraph, found: _Found) -> AveragingSolution:
+    graph = jax.lax.stop_gradient(graph)
+    belief = jnp.where(graph.weight > 0, jax.nn.sigmoid(found.own), 0)
+    rounds = found.search.round
+    return solution(graph, found.search.T, edge_weight=belief, num_steps=rounds)
 
 
 def _forest(graph: PoseGraph, odds: Array) -> trees.Forest:

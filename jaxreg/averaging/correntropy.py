@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -99,19 +100,22 @@ class Correntropy(AbstractAverager):
     ) -> AveragingSolution:
         """Averages a prepared graph."""
         if self.width == "annealed" and graph.num_poses > DENSE_LIMIT:
-            end = self._graduated(graph, init, key)
-        else:
-            T_start = start(self.initialiser, graph, init, key)
-            narrow = self._annealed if self.width == "annealed" else self._paper
-            end = narrow(graph, T_start, init is None)
-        return solution(
-            graph,
-            end.T_world_i,
-            edge_weight=end.trust,
-            converged=end.converged,
-            kernel_width=end.width,
-            num_steps=end.num_steps,
-        )
+            return self._large(graph, init, key)
+        T_start = start(self.initialiser, graph, init, key)
+        return self._small(graph, T_start, init is None)
+
+    @compiled
+    def _large(
+        self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
+    ) -> AveragingSolution:
+        return _solution(graph, self._graduated(graph, init, key))
+
+    @compiled
+    def _small(
+        self, graph: PoseGraph, T_start: Float[Array, "v D D"], compare: bool
+    ) -> AveragingSolution:
+        end = self._annealed if self.width == "annealed" else self._paper
+        return _solution(graph, end(graph, T_start, compare))
 
     def _paper(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"], _: bool
@@ -205,6 +209,17 @@ class Correntropy(AbstractAverager):
             # pulls against them would bend it for good.
             starts = [_better_start(graph, init, rows, graph)]
         return graduated(graph, near, jnp.stack(starts), self.max_steps)
+
+
+def _solution(graph: PoseGraph, end: Iterated) -> AveragingSolution:
+    return solution(
+        graph,
+        end.T_world_i,
+        edge_weight=end.trust,
+        converged=end.converged,
+        kernel_width=end.width,
+        num_steps=end.num_steps,
+    )
 
 
 def _better_start(

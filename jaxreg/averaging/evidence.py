@@ -49,11 +49,13 @@ def votes(graph: PoseGraph) -> Float[Array, " e"]:
 
 def agreement(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     """Edges that agree, by `votes`, summed over the ladder of scales."""
+    return jnp.sum(_agreed(graph, T_world_i, scale))
+
+
+def _agreed(graph: PoseGraph, T_world_i: Array, scale: Array) -> Float[Array, " s"]:
     sq, count = squared_errors(graph, T_world_i, scale), votes(graph)
-    total = jnp.zeros((), sq.dtype)
-    for width in SCALES:
-        total = total + jnp.sum(count * jnp.exp(-sq / (2 * width**2)))
-    return total
+    width = jnp.asarray(SCALES, sq.dtype)[:, None]
+    return jnp.sum(count * jnp.exp(-sq / (2 * width**2)), axis=1)
 
 
 def redundancies(graph: PoseGraph, T_world_i: Array) -> Float[Array, " s"]:
@@ -61,11 +63,10 @@ def redundancies(graph: PoseGraph, T_world_i: Array) -> Float[Array, " s"]:
 
     A chain of motions agrees with its own edges, however far it drifts.
     """
-    sq, count = squared_errors(graph, T_world_i, length_scale(graph)), votes(graph)
+    count = votes(graph)
     usual = jnp.sum(count) / jnp.maximum(jnp.sum(count > 0), 1)
     free = (graph.num_poses - 1) * usual
-    agreed = [jnp.sum(count * jnp.exp(-sq / (2 * w**2))) for w in SCALES]
-    return jnp.maximum(jnp.stack(agreed) - free, 0)
+    return jnp.maximum(_agreed(graph, T_world_i, length_scale(graph)) - free, 0)
 
 
 def redundancy(graph: PoseGraph, T_world_i: Array) -> Array:

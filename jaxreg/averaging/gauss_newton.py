@@ -27,37 +27,45 @@ def normal_equations(
     """
     num, k = graph.num_poses, precision.shape[-1]
     i, j = graph.edges[:, 0], graph.edges[:, 1]
-    J = _jacobian(graph, T_world_i)
+    J, error = _linearised(graph, T_world_i)
     WJ = product(precision, J)
     JWJ = product(jnp.swapaxes(J, -1, -2), WJ)
     H = jnp.zeros((num, num, k, k), J.dtype)
     H = H.at[i, i].add(JWJ).at[j, j].add(precision)
     H = H.at[j, i].add(WJ).at[i, j].add(jnp.swapaxes(WJ, -1, -2))
-    g = forces(graph, T_world_i, precision)
+    g = _pulled(graph, J, precision, error)
     free = jnp.trace(H[jnp.arange(num), jnp.arange(num)], axis1=-2, axis2=-1) > 0
-    free = free.at[0].set(False)
-    both = free[:, None, None, None] & free[None, :, None, None]
-    H = jnp.where(both, H, 0).transpose(0, 2, 1, 3).reshape(num * k, num * k)
-    held = jnp.repeat(~free, k).astype(H.dtype)
-    return H + jnp.diag(held), jnp.where(free[:, None], g, 0).reshape(-1)
+    free = jnp.repeat(free.at[0].set(False), k)
+    H = H.transpose(0, 2, 1, 3).reshape(num * k, num * k)
+    H = jnp.where(free[:, None] & free[None, :], H, 0)
+    held = (~free).astype(H.dtype)
+    return H + jnp.diag(held), jnp.where(free, g.reshape(-1), 0)
 
 
 def forces(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"], precision: Float[Array, "e k k"]
 ) -> Float[Array, "v k"]:
     """J' W r, by frame."""
-    i, j = graph.edges[:, 0], graph.edges[:, 1]
-    error = graph.tangent_errors(T_world_i)
-    J = _jacobian(graph, T_world_i)
-    We = jnp.sum(precision * error[:, None, :], axis=-1)
-    g = jnp.zeros((graph.num_poses, error.shape[-1]), error.dtype).at[j].add(We)
-    return g.at[i].add(jnp.sum(J * We[:, :, None], axis=-2))
+    J, error = _linearised(graph, T_world_i)
+    return _pulled(graph, J, precision, error)
 
 
-def _jacobian(graph: PoseGraph, T_world_i: Array) -> Array:
-    """The derivative of the error with respect to x_i; that to x_j is the identity."""
+def _pulled(graph: PoseGraph, J: Array, precision: Array, error: Array) -> Array:
+    We = jnp.einsum("eab,eb->ea", precision, error)
+    g = jnp.zeros((graph.num_poses, error.shape[-1]), error.dtype)
+    g = g.at[graph.edges[:, 1]].add(We)
+    return g.at[graph.edges[:, 0]].add(jnp.einsum("eab,ea->eb", J, We))
+
+
+def _linearised(graph: PoseGraph, T_world_i: Array) -> tuple[Array, Array]:
+    """The derivative of the errors with respect to x_i, and the errors.
+
+    That with respect to x_j is the identity.
+    """
     i, j = graph.edges[:, 0], graph.edges[:, 1]
-    return -lie.adjoint(product(lie.inverse(T_world_i)[j], T_world_i[i]))
+    T_j_i = product(lie.inverse(T_world_i)[j], T_world_i[i])
+    error = lie.log(lie.inverse(product(T_j_i, graph.T_i_j)))
+    return -lie.adjoint(T_j_i), error
 
 
 def precisions(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
 from jaxreg.averaging.iterate import (
@@ -44,6 +45,7 @@ class MotionAveraging(AbstractAverager):
     tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = SpanningTree(by="path")
 
+    @compiled
     def solve(
         self,
         graph: PoseGraph,
@@ -80,6 +82,7 @@ class WeightedMotionAveraging(AbstractAverager):
     def __check_init__(self) -> None:
         check_rows(self.rows)
 
+    @compiled
     def solve(
         self,
         graph: PoseGraph,

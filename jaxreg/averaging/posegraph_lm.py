@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -85,6 +86,7 @@ class PoseGraphLM(AbstractAverager):
                 f"objective: wanted 'log' or 'chordal', found {self.objective!r}."
             )
 
+    @compiled
     def solve(
         self,
         graph: PoseGraph,

@@ -15,7 +15,7 @@ _DEVIATIONS = 3.0
 _INSIDE = 0.05
 #: Medians of chi-squared laws by their degrees of freedom.
 CHI2_MEDIAN = {1: 0.4549, 2: 1.3863, 3: 2.3660, 6: 5.3481}
-_NARROWEST_STEP = 0.5
+_NARROWEST_STEP = 0.25
 
 
 def gaussian_trust(
@@ -50,9 +50,10 @@ def annealed_width(
 ) -> Float[Array, "2"]:
     """The next width: three deviations of the edges inside the present one.
 
-    Never wider than before and at most halved. The weighted mean square v of Gaussian
-    noise of variance s^2 under a Gaussian kernel of width w is 1 / (1/s^2 + 1/w^2),
-    which is solved for s^2; s^2 is enlarged for the unknowns that the poses take up.
+    Never wider than before, nor narrower than a quarter of it. The weighted mean square
+    v of Gaussian noise of variance s^2 under a Gaussian kernel of width w is
+    1 / (1/s^2 + 1/w^2), which is solved for s^2; s^2 is enlarged for the unknowns that
+    the poses take up.
     `scale` is the `length_scale` of the graph.
     """
     d = graph.dim

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
 from jaxreg.graph import trees
@@ -32,6 +33,7 @@ class SpanningTree(AbstractAverager):
         if self.by not in ("weight", "path"):
             raise ValueError(f"by: wanted 'weight' or 'path', found {self.by!r}.")
 
+    @compiled
     def solve(
         self,
         graph: PoseGraph,
