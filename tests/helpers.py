@@ -31,6 +31,15 @@ def blob(n: int, d: int, seed: int = 0) -> np.ndarray:
     return (radius[:, None] * x).astype(np.float32)
 
 
+def half_noise(points: np.ndarray, seed: int) -> np.ndarray:
+    """Half of the points replaced by uniform ones in their bounding box."""
+    rng = np.random.default_rng(seed)
+    out, rows = points.copy(), rng.permutation(len(points))[: len(points) // 2]
+    size = (len(rows), points.shape[1])
+    out[rows] = rng.uniform(points.min(0), points.max(0), size)
+    return out
+
+
 def motion(seed: int, d: int, angle: float | None = None, shift: float = 1.0):
     """A random rigid motion `(d+1, d+1)`, float64; `angle` in radians, None: any."""
     rng = np.random.default_rng(seed)

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import blob
+from helpers import blob, half_noise
 from scipy.spatial import KDTree
 
 from jaxreg.cloud import (
@@ -11,11 +11,13 @@ from jaxreg.cloud import (
     median_spacing,
     rms_radius,
     thin,
+    without_noise,
 )
 
 
 N = 6000
 _thin = jax.jit(thin, static_argnums=2)
+_without_noise = jax.jit(without_noise)
 
 
 def _sphere(d: int) -> np.ndarray:
@@ -80,3 +82,48 @@ def test_moments_ignore_masked_rows_and_survive_an_offset():
         offset = points[:250] - points[:250].mean(0)
         expected = np.sqrt(np.mean(np.sum(offset**2, 1)))
         assert float(rms_radius(*args)) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_noise_that_fills_the_box_is_dropped_and_the_surface_kept(d):
+    clean = np.concatenate([blob(N, d)] * 2)[:10_000] * [1, 1, 0.5][:d]
+    clean = clean + 1e-3 * np.random.default_rng(0).standard_normal(clean.shape)
+    points = half_noise(clean.astype(np.float32), seed=1)
+    real = np.all(points == clean.astype(np.float32), axis=1)
+    mask = np.arange(10_000) < 9_000
+    points[~mask] = np.nan
+    points = jnp.asarray(np.nan_to_num(points, nan=50.0))
+    keep = np.asarray(_without_noise(points, jnp.asarray(mask)))
+    assert not np.any(keep & ~mask)
+    assert keep[mask & real].mean() > 0.9
+    assert keep[mask & ~real].mean() < 0.2
+
+
+def _clean() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    x, y, z = rng.uniform(-1, 1, (3, N))
+    turn, ring = 40 * np.pi * x, np.floor(12 * np.abs(y)) ** 2
+    return {
+        "blob": blob(N, 3),
+        "curve": blob(N, 2),
+        "wall": np.stack([x, y, 0.002 * z], 1),
+        "corner of a room, one wall sparse": np.stack(
+            [np.where(z < 0.8, x, -1), y, np.where(z < 0.8, 0.01 * x, z * x)], 1
+        ),
+        "rings of a lidar": np.stack(
+            [ring * np.cos(turn), ring * np.sin(turn), 0.02 * ring * np.abs(z)], 1
+        ),
+        "one place": np.ones((N, 3)),
+    }
+
+
+@pytest.mark.parametrize("name", list(_clean()))
+def test_scans_without_noise_are_kept_whole(name):
+    points = jnp.asarray(_clean()[name], jnp.float32)
+    keep = _without_noise(points, jnp.ones(N, bool))
+    assert np.mean(keep) > 0.999
+
+
+def test_points_that_nothing_stands_out_from_are_kept():
+    points = jax.random.uniform(jax.random.key(0), (N, 3))
+    assert np.all(_without_noise(points, jnp.ones(N, bool)))

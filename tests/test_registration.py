@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import blob, motion, move, pose_error
+from helpers import blob, half_noise, motion, move, pose_error
 
 import jaxreg as jr
 from jaxreg import Status
@@ -113,6 +113,17 @@ def test_icp_from_a_near_guess(d, method):
     assert angle < (0.02 if planes else 0.05)
     assert shift < 0.03
     assert int(sol.status) == Status.CONVERGED
+
+
+def test_half_of_the_points_may_be_noise():
+    truth = motion(3, 3, angle=0.15, shift=0.05)
+    source = half_noise(blob(10_000, 3, 1), 1)
+    target = half_noise(move(truth, blob(10_000, 3, 2)), 2)
+    found = jr.register(source, target, jr.ICP())
+    angle, shift = pose_error(found.T_target_source, truth)
+    assert int(found.status) == Status.CONVERGED
+    assert angle < 0.003
+    assert shift < 0.003
 
 
 def test_unit_and_place_of_the_input_do_not_matter():

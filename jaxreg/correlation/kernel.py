@@ -11,7 +11,7 @@ from jaxreg._core.arrays import cast_floats, traced
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
-from jaxreg.cloud import PointCloud, median_spacing, thin
+from jaxreg.cloud import PointCloud, median_spacing, thin, without_noise
 from jaxreg.correlation.ascent import ascend, is_free, newton_step
 from jaxreg.correlation.quadratic import Quadratic, pull_on_target
 from jaxreg.geometry import lie
@@ -112,7 +112,7 @@ class KernelCorrelation(AbstractRegistrar):
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
         """Thinned to `max_points`; the normals serve the scores alone."""
-        return thin(points, mask, self.max_points)
+        return thin(points, without_noise(points, mask), self.max_points)
 
     def solve(
         self,

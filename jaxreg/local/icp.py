@@ -15,7 +15,13 @@ from jaxreg._core.arrays import cast_floats, traced
 from jaxreg._core.padding import spread_rows
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
-from jaxreg.cloud import PointCloud, median_spacing, rms_radius, thin
+from jaxreg.cloud import (
+    PointCloud,
+    median_spacing,
+    rms_radius,
+    thin,
+    without_noise,
+)
 from jaxreg.geometry import lie
 from jaxreg.local.base import AbstractRegistrar, Modes, RegistrationSolution
 from jaxreg.local.curvature import Curvature, is_degenerate
@@ -96,8 +102,8 @@ class ICP(AbstractRegistrar):
         return eqx.tree_at(lambda m: m.max_correspondence_distance, self, limit)
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
-        """Thinned to `max_points`, in spatial order, with normals."""
-        return thin(points, mask, self.max_points)
+        """Without noise that fills the box, thinned, in spatial order, with normals."""
+        return thin(points, without_noise(points, mask), self.max_points)
 
     def solve(
         self,

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.arrays import cast_floats, on_both
 from jaxreg._core.checks import check_key, is_concrete
 from jaxreg._core.typing import Key, Mask, Motion, Points
-from jaxreg.cloud import PointCloud, levelled, thin
+from jaxreg.cloud import PointCloud, levelled, thin, without_noise
 from jaxreg.local import (
     AbstractRegistrar,
     AbstractResidual,
@@ -77,7 +77,8 @@ class AbstractSearch(AbstractRegistrar):
         return eqx.tree_at(lambda m: m.prior, self, self.prior.in_frames(centred, d))
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
-        """Thinned to `max_points`, with normals."""
+        """Without noise that fills the box, thinned to `max_points`, with normals."""
+        mask = without_noise(points, mask)
         return thin(points, mask, self.max_points, _NORMAL_NEIGHBOURS)
 
     def solve(

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import blob, motion, move, pose_error
+from helpers import blob, half_noise, motion, move, pose_error
 
 import jaxreg as jr
 from jaxreg import Status
@@ -163,6 +163,16 @@ def test_bad_scans_are_reported_and_the_others_placed(sculpture):
     for i in placed:
         T_true = np.linalg.inv(truth[first]) @ truth[i]
         assert pose_error(sol.T_world_i[i], T_true)[0] < 0.03
+
+
+def test_half_noise_leaves_all_scans_placed(sculpture):
+    scans, truth = sculpture
+    scans = [half_noise(x, seed) for seed, x in enumerate(scans)]
+    sol = jr.reconstruct(scans, key=jax.random.key(0), method=FILTER)
+    assert np.all(sol.placed)
+    errors = np.array(_errors(sol, truth))
+    assert errors[:, 0].max() < 0.02
+    assert errors[:, 1].max() < 0.004
 
 
 def test_floor_plans_in_the_plane():
