@@ -14,7 +14,6 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from jaxreg._core.arrays import cast_floats
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import AbstractAverager, Correntropy, SpanningTree
 from jaxreg.geometry import lie
@@ -66,7 +65,7 @@ def refine(
     return placement
 
 
-@compiled
+@eqx.filter_jit
 def _updated(before: Placement, after: Placement) -> Placement:
     """The later poses of the scans that both hold, in the earlier frame."""
     held = before.placed & after.placed
@@ -77,7 +76,8 @@ def _updated(before: Placement, after: Placement) -> Placement:
     return eqx.tree_at(lambda p: (p.T_world_i, p.placed), before, (T, held))
 
 
-@compiled
+# Not `compiled`: the older generator takes minutes and 13 GB over the exact search.
+@eqx.filter_jit
 def _measured(
     scans: PreparedScans, placement: Placement, min_overlap: Scalar, *, exact: bool
 ) -> RelativeMotions:
