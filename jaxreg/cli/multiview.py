@@ -44,6 +44,9 @@ class Multiview(Options):
     """Pose file of the Stanford repository (.conf, metres): adds a table of errors."""
     order: Order = "any"
     """Of the scans; sequential if each overlaps the next: fewer pairs are tried."""
+    viewpoint: tuple[float, ...] | None = None
+    """Where the scanner stood in the frame of every scan, such as 0 0 0: poses that put
+    points into what it saw to be free are told from right ones."""
     resume: bool = False
     """Go on with the pairs that an interrupted run left in the output folder."""
 
@@ -55,12 +58,15 @@ class Multiview(Options):
                     "No scans given.\nUsage: jaxreg multiview SCAN SCAN ..."
                 )
             scans = load_scans(self.scans)
+            _check_viewpoint(self.viewpoint, scans)
             truth = None if self.truth is None else _read_truth(self.truth, scans)
         require_writable(self.out)
         key, log = self.key(), self._log(scans)
         try:
             with session.progress() as progress, session.timed("run", computes=True):
-                result = reconstruct_scans(scans, key, progress, self.order, log)
+                result = reconstruct_scans(
+                    scans, key, progress, self.order, log, self.viewpoint
+                )
         except KeyboardInterrupt as err:
             if not len(log):
                 raise
@@ -81,6 +87,7 @@ class Multiview(Options):
         run = {
             "scans": digest.hexdigest(),
             "seed": self.seed,
+            "viewpoint": self.viewpoint,
             "version": version("jaxreg"),
         }
         return PairLog(self.out / "pairs.jsonl", run, resume=self.resume)
@@ -92,6 +99,7 @@ def reconstruct_scans(
     progress: Progress,
     order: Order = "any",
     log: PairLog | None = None,
+    viewpoint: tuple[float, ...] | None = None,
 ) -> Result:
     """Reconstructs centred scans and moves the answer to the frames of the files.
 
@@ -100,11 +108,13 @@ def reconstruct_scans(
     import jaxreg
 
     centred, middles = scans.centred()
+    eyes = None if viewpoint is None else (viewpoint - middles).astype(np.float32)
     kept = None if log is None or log.pairs is None else log.pairs
     sol = jaxreg.reconstruct(
         centred,
         key=key,
         order=order,
+        viewpoints=eyes,
         previous=None if kept is None else jaxreg.RelativeMotions(*map(_array, kept)),
         progress=progress,
         on_pairs=None if log is None else lambda m: log.add(_pairs(m)),
@@ -129,6 +139,21 @@ def reconstruct_scans(
         weight=np.asarray(sol.edge_weight)[keep],
         inlier_rmse=np.asarray(sol.inlier_rmse)[keep],
     )
+
+
+def _check_viewpoint(viewpoint: tuple[float, ...] | None, scans: Scans) -> None:
+    d = scans.points[0].shape[1]
+    if viewpoint is None:
+        return
+    if len(viewpoint) != d or not np.all(np.isfinite(viewpoint)):
+        found = " ".join(map(str, viewpoint))
+        raise InputError(f"--viewpoint: wanted {d} finite numbers, found {found}.")
+    for points, place in zip(scans.points, scans.places, strict=True):
+        if np.any(np.all(points == np.asarray(viewpoint), axis=1)):
+            raise InputError(
+                f"{place}: has points at --viewpoint.\n"
+                "Leave out rows that stand for missing returns."
+            )
 
 
 def _array(x: np.ndarray) -> Any:

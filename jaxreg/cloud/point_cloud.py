@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.typing import Mask, Points
+from jaxreg.cloud.range_image import RangeImage
 
 
 class PointCloud(eqx.Module):
@@ -14,11 +15,13 @@ class PointCloud(eqx.Module):
         points: `(n, d)`.
         normals: `(n, d)` unit normals of either sign; zero where undefined.
         mask: `(n,)` True for valid points.
+        seen: what the scanner saw of them, where its viewpoint is known.
     """
 
     points: Float[Array, "n d"]
     normals: Float[Array, "n d"]
     mask: Bool[Array, " n"]
+    seen: RangeImage | None = None
 
     def padded(self, num: int) -> "PointCloud":
         """With masked rows behind it, `num` in all."""
@@ -27,11 +30,18 @@ class PointCloud(eqx.Module):
             jnp.pad(self.points, (rows, (0, 0))),
             jnp.pad(self.normals, (rows, (0, 0))),
             jnp.pad(self.mask, rows),
+            self.seen,
         )
 
     def first(self, num: int) -> "PointCloud":
         """The first `num` rows, or all."""
-        return PointCloud(self.points[:num], self.normals[:num], self.mask[:num])
+        points, normals = self.points[:num], self.normals[:num]
+        return PointCloud(points, normals, self.mask[:num], self.seen)
+
+    def seen_from(self, viewpoint: Float[Array, " d"]) -> "PointCloud":
+        """With what was seen of it from there; of NaN nothing is known."""
+        seen = RangeImage.of(self.points, self.mask, viewpoint)
+        return PointCloud(self.points, self.normals, self.mask, seen)
 
 
 def levelled(a: PointCloud, b: PointCloud) -> tuple[PointCloud, PointCloud]:

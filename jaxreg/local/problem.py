@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.cloud import PointCloud
+from jaxreg.cloud import PointCloud, RangeImage
 from jaxreg.geometry import lie
 from jaxreg.neighbours.base import AbstractIndex
 
@@ -24,6 +24,7 @@ class Problem(eqx.Module):
         source_mask: `(n,)`.
         target: `(m, 2d)` points and unit normals of either sign, side by side.
         index: closest points among the target.
+        seen: what the target's scanner saw, where its viewpoint is known.
     """
 
     source: Float[Array, "d n"]
@@ -31,6 +32,7 @@ class Problem(eqx.Module):
     source_mask: Bool[Array, " n"]
     target: Float[Array, "m two_d"]
     index: AbstractIndex
+    seen: RangeImage | None = None
 
     @classmethod
     def of(
@@ -43,6 +45,7 @@ class Problem(eqx.Module):
             source.mask,
             jnp.concatenate([target.points, target.normals], axis=1),
             index,
+            target.seen,
         )
 
     def of_rows(self, rows: Int[Array, " r"] | slice) -> "Problem":
@@ -53,6 +56,7 @@ class Problem(eqx.Module):
             self.source_mask[rows],
             self.target,
             self.index,
+            self.seen,
         )
 
     def every(self, step: int) -> "Problem":
@@ -72,6 +76,7 @@ class Problem(eqx.Module):
             jnp.pad(self.source_mask, (0, pad)),
             self.target,
             self.index,
+            self.seen,
         )
 
 

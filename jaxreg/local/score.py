@@ -6,7 +6,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import on_both
-from jaxreg._core.typing import Motion
+from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import PointCloud, levelled
 from jaxreg.geometry import lie
 from jaxreg.local.problem import Match, Problem, match
@@ -22,6 +22,9 @@ _COSINE_SQ = 0.75
 # surface, but clearly over or under its plane, with normals within 45 degrees.
 _OVER, _FAR_OVER = 0.35, 3.0
 _ALIKE_SQ = 0.5
+# It speaks against the pose, as much as so many others for it, if it is so many sample
+# spacings before the surface that the other scanner saw: that ray was free.
+_BEFORE, _AGAINST = 1.5, 100.0
 
 
 class Score(eqx.Module):
@@ -32,18 +35,25 @@ class Score(eqx.Module):
         inlier_rmse: residual of that share.
         num_inliers: int32, points in that share.
         num_conflicts: int32, points over or under the other surface.
+        num_before: int32, points in what the other scanner saw to be free; zero where
+            its viewpoint is not known.
     """
 
     fitness: Float[Array, "*q"]
     inlier_rmse: Float[Array, "*q"]
     num_inliers: Int[Array, "*q"]
     num_conflicts: Int[Array, "*q"]
+    num_before: Int[Array, "*q"]
 
     @property
     def consistency(self) -> Float[Array, "*q"]:
-        """Share of the inliers among the points that agree or conflict."""
+        """Share of the inliers among the points that agree or conflict.
+
+        Points in free space count many times over: at right poses of scans there are
+        none but those of noise, at wrong ones as a rule some in a hundred.
+        """
         agree = self.num_inliers.astype(self.fitness.dtype)
-        either = self.num_inliers + self.num_conflicts
+        either = agree + self.num_conflicts + _AGAINST * self.num_before
         return agree / jnp.maximum(either, 1)
 
 
@@ -57,7 +67,21 @@ def score(
         T_target_source: the pose.
         spacing: distance between samples of the coarser cloud.
     """
-    return score_match(match(problem, T_target_source), spacing)
+    found = match(problem, T_target_source)
+    return score_match(
+        found, spacing, _num_before(problem, T_target_source, found, spacing)
+    )
+
+
+def _num_before(
+    problem: Problem, T_target_source: Motion, found: Match, spacing: Scalar
+) -> Int[Array, ""]:
+    """Source points in the target's free space."""
+    if problem.seen is None:
+        return jnp.zeros((), jnp.int32)
+    moved = found.rotated + lie.translation(T_target_source)[:, None]
+    before = problem.seen.depth_before(moved) > _BEFORE * spacing
+    return jnp.sum(before & found.mask).astype(jnp.int32)
 
 
 def agreeing(found: Match, spacing: Float[Array, ""]) -> Bool[Array, " n"]:
@@ -77,7 +101,9 @@ def _height_sq(found: Match) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
     return jnp.where(flat, found.plane_residual**2, found.sq_residual), flat
 
 
-def score_match(found: Match, spacing: Float[Array, ""]) -> Score:
+def score_match(
+    found: Match, spacing: Scalar, num_before: Int[Array, ""] | None = None
+) -> Score:
     """`score` of correspondences that are known already."""
     height, flat = _height_sq(found)
     inlier = agreeing(found, spacing)
@@ -93,7 +119,10 @@ def score_match(found: Match, spacing: Float[Array, ""]) -> Score:
     sq = jnp.sum(jnp.where(inlier, height, 0)) / jnp.maximum(count, 1)
     fitness = (count / total).astype(sq.dtype)
     num_conflicts = jnp.sum(conflict).astype(jnp.int32)
-    return Score(fitness, jnp.sqrt(sq), count.astype(jnp.int32), num_conflicts)
+    count = count.astype(jnp.int32)
+    if num_before is None:
+        num_before = jnp.zeros_like(count)
+    return Score(fitness, jnp.sqrt(sq), count, num_conflicts, num_before)
 
 
 def mutual_overlap(there: Score, back: Score) -> Float[Array, "*q"]:
@@ -144,4 +173,4 @@ def score_both_ways(
 
 def _no_score(T: Motion) -> Score:
     none = jnp.zeros((), jnp.int32)
-    return Score(jnp.zeros((), T.dtype), jnp.zeros((), T.dtype), none, none)
+    return Score(jnp.zeros((), T.dtype), jnp.zeros((), T.dtype), none, none, none)

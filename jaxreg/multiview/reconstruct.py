@@ -7,24 +7,15 @@ all pairs; called with arrays, a thin loop chooses the pairs round by round, run
 batches of them at a time, and reports progress.
 """
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from jaxreg._core.checks import (
-    as_float_array,
-    check_key,
-    check_mask,
-    check_points,
-    is_concrete,
-)
-from jaxreg._core.padding import rounded_up, stacked
+from jaxreg._core.checks import check_key, is_concrete
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.multiview.finish import finish
+from jaxreg.multiview.inputs import checked_viewpoints, padded_scans
 from jaxreg.multiview.plan import Order, all_pairs, first_pairs
 from jaxreg.multiview.relative import RelativeMotions, relative_motions
 from jaxreg.multiview.rounds import OnPairs, Rounds
@@ -40,6 +31,7 @@ def reconstruct(
     method: ParticleFilter | None = None,
     averaging: AbstractAverager | None = None,
     mask: object = None,
+    viewpoints: object = None,
     order: Order | str = "any",
     previous: object = None,
     progress: Progress | None = None,
@@ -58,6 +50,10 @@ def reconstruct(
         averaging: how relative motions become poses; None for `Correntropy` from the
             spanning tree of largest overlap.
         mask: `(v, n)` True for valid points, for a padded array only.
+        viewpoints: where each scan's scanner stood, in the scan's own frame: `(v, d)`,
+            or a list with None for those that are not known. A scan saw free space
+            between its viewpoint and its points, and poses that put points of others
+            there count as contradicted. Only for scans from one place each.
         order: "sequential" if each scan overlaps the next: only neighbours are
             registered to begin with, of any number of scans; not under `jit`.
         previous: a `ReconstructionSolution` of the first of these scans, whose pairs
@@ -82,7 +78,8 @@ def reconstruct(
     Reference:
         Sandhu, Dambreville, Tannenbaum for the pairs; Zhu et al. for the averaging.
     """
-    points, row_mask = _padded(scans, mask)
+    points, row_mask = padded_scans(scans, mask)
+    eyes = checked_viewpoints(viewpoints, points, row_mask)
     method = ParticleFilter() if method is None else method
     if not isinstance(method, ParticleFilter):
         raise TypeError(
@@ -95,14 +92,14 @@ def reconstruct(
             raise ValueError(
                 "order, previous, on_pairs: pairs are chosen outside of jit only."
             )
-        prepared = prepare_scans(method, points, row_mask)
+        prepared = prepare_scans(method, points, row_mask, eyes)
         pairs = jnp.asarray(all_pairs(points.shape[0]))
         motions = relative_motions(method, prepared, pairs, key)
         return finish(method, averaging, prepared, motions)
 
     report = progress if progress is not None else _silent
     report("preparing scans", 0, 1)
-    prepared = jax.block_until_ready(prepare_scans(method, points, row_mask))
+    prepared = jax.block_until_ready(prepare_scans(method, points, row_mask, eyes))
     report("preparing scans", 1, 1)
     known, first = _known(previous, prepared, order)
     rounds = Rounds(method, averaging, prepared, key, known, on_pairs, report)
@@ -158,33 +155,3 @@ def _checked(order: str) -> Order:
 
 def _silent(stage: str, done: int, total: int) -> None:
     del stage, done, total
-
-
-def _padded(scans: object, mask: object) -> tuple[Array, Array]:
-    """Scans as `(v, n, d)` with a mask."""
-    if isinstance(scans, Sequence):
-        if mask is not None:
-            raise ValueError("mask: only for a padded array, not for a list of scans.")
-        arrays = [as_float_array(x, f"scans[{i}]") for i, x in enumerate(scans)]
-        for i, x in enumerate(arrays):
-            check_points(x, f"scans[{i}]")
-            if x.ndim != 2 or x.shape[1] != arrays[0].shape[1]:
-                raise ValueError(
-                    f"scans[{i}]: wanted shape (n, {arrays[0].shape[-1]}) like "
-                    f"scans[0], found {x.shape}."
-                )
-        if len(arrays) < 2:
-            raise ValueError(f"scans: wanted two or more, found {len(arrays)}.")
-        dtype = jnp.result_type(*arrays)
-        lengths = np.array([len(x) for x in arrays])
-        rows = rounded_up(max(lengths.tolist()))
-        row_mask = jnp.asarray(np.arange(rows) < lengths[:, None])
-        return stacked([x.astype(dtype) for x in arrays], rows), row_mask
-    points = as_float_array(scans, "scans")
-    check_points(points, "scans")
-    if points.ndim != 3 or points.shape[0] < 2:
-        raise ValueError(
-            "scans: wanted a list of two or more (n, d) arrays or a padded array "
-            f"(v, n, d), found shape {points.shape}."
-        )
-    return points, check_mask(mask, points.shape[:2], "mask")

@@ -18,7 +18,8 @@ class PreparedScans(eqx.Module):
     """Scans with a leading axis, each in its own centred frame, in one common scale.
 
     Attributes:
-        clouds: `(v, n, d)` thinned points with normals; the unit is `radius`.
+        clouds: `(v, n, d)` thinned points with normals; the unit is `radius`. With what
+            was seen from the viewpoints, where these are given.
         tables: their voxel tables.
         mean: `(v, d)` centroid of each scan in its input frame.
         radius: the median root mean square radius of the scans, in the input's unit.
@@ -98,13 +99,19 @@ def prepare_scan(
 
 @compiled
 def prepare_scans(
-    method: ParticleFilter, points: Float[Array, "v n d"], mask: Bool[Array, "v n"]
+    method: ParticleFilter,
+    points: Float[Array, "v n d"],
+    mask: Bool[Array, "v n"],
+    viewpoints: Float[Array, "v d"] | None = None,
 ) -> PreparedScans:
-    """Prepares all scans, one after another."""
+    """Prepares all scans, one after another; NaN stands for an unknown viewpoint."""
     points, mask, dropped = clean(points, mask)
     radius = common_radius(points, mask)
     clouds, tables, mean, spacing = lax.map(
         lambda scan: prepare_scan(method, scan[0], scan[1], radius), (points, mask)
     )
+    if viewpoints is not None:
+        eyes = (viewpoints - mean) / radius
+        clouds = lax.map(lambda scan: scan[0].seen_from(scan[1]), (clouds, eyes))
     enough = (jnp.sum(clouds.mask, axis=1) > points.shape[-1]) & (spacing > 0)
     return PreparedScans(clouds, tables, mean, radius, spacing, enough, dropped)

@@ -158,6 +158,20 @@ def test_multiview_far_from_the_origin_keeps_its_digits(
     assert poses.shape == (2, 4, 4)
 
 
+def test_a_viewpoint_is_moved_with_each_scan(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)
+    given = _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans, "--viewpoint", "0", "-9", "1"]) == 0
+    eyes = given[0][2]["viewpoints"]
+    for eye, points, file in zip(eyes, given[0][0], scans, strict=True):
+        moved = np.load(folder / file)[0] - points[0]
+        np.testing.assert_allclose(eye + moved, [0, -9, 1], atol=1e-5)
+    assert main(["multiview", *scans, "--viewpoint", "0", "1"]) == 2
+    assert "--viewpoint: wanted 3 finite numbers" in capsys.readouterr().err
+
+
 def test_truth_adds_errors(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -92,3 +92,14 @@ def test_surfaces_that_move_in_themselves_slip():
 def test_points_without_normals_hold_a_pose():
     points = blob(400, 3)
     assert not _slips(points, np.zeros_like(points))
+
+
+def test_points_that_the_other_scanner_looked_through_speak_against_a_pose():
+    wall, ahead = _cloud(_floor(0), UP), np.concatenate([_floor(0), _floor(1)[100:104]])
+    eye = jnp.array([0.75, 0.75, 3.0])
+    source = _cloud(ahead, np.tile([0.0, 0.0, 1.0], (260, 1)))
+    for target, before in ((wall, 0), (wall.seen_from(eye), 4)):
+        found = score(_problem(source, target), EYE, jnp.float32(SPACING))
+        assert int(found.num_before) == before
+        assert int(found.num_inliers) == 256
+        assert float(found.consistency) == pytest.approx(256 / (256 + 100 * before))

@@ -221,3 +221,23 @@ def test_wrong_scans_are_named(scans, words):
 def test_wrong_options_are_named(sculpture, options, error, words):
     with pytest.raises(error, match=words):
         jr.reconstruct(sculpture[0], key=jax.random.key(0), method=FILTER, **options)
+
+
+@pytest.mark.parametrize(
+    ("viewpoints", "words"),
+    [
+        (np.zeros(3), r"viewpoints: .*\(3,\) for each of 8 scans.*found shape \(3,\)"),
+        ([None] * 7, r"each of 8 scans, found shape \(7, 3\)"),
+        ([np.zeros(2)] + [None] * 7, r"viewpoints\[0\]: wanted shape \(3,\) or None"),
+        (np.full((8, 3), np.nan), r"viewpoints\[0\]: wanted finite.*None where"),
+    ],
+)
+def test_wrong_viewpoints_are_named(sculpture, viewpoints, words):
+    with pytest.raises(ValueError, match=words):
+        jr.reconstruct(sculpture[0], key=jax.random.key(0), viewpoints=viewpoints)
+
+
+def test_a_viewpoint_on_a_point_is_refused(sculpture):
+    viewpoints = [None, sculpture[0][1][5], *6 * [None]]
+    with pytest.raises(ValueError, match=r"viewpoints\[1\]: is a point.*row 5"):
+        jr.reconstruct(sculpture[0], key=jax.random.key(0), viewpoints=viewpoints)
