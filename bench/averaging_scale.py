@@ -1,12 +1,13 @@
 """Many small graphs in one call, and single graphs of 10,000 and 100,000 poses.
 
 Run: python -m bench.averaging_scale batch [--graphs 1000] [--vmap]
+     (XLA_FLAGS=--xla_force_host_platform_device_count=2 for two cores)
      python -m bench.averaging_scale large [--poses 10000] [--outliers 0] [--single]
 
 batch  graphs of 32 poses and 465 edges, inlier noise 0.5 degrees and 0.5 % of the size,
        30 % of the motions uniformly random; `average` of all in one call, by `lax.map`
-       one after the other or, with --vmap, side by side (where a graph that needs a
-       longer search keeps all others busy).
+       one after the other, on each device its share, or, with --vmap, side by side
+       (where a graph that needs a longer search keeps all others busy).
 large  a path in rings of 100 poses: each pose measured from the next and from three on
        the next ring (3.85 edges a pose), noise 1 degree and 0.02 of the distance of
        poses; a share of the edges, all of them closures, joins random poses instead by
@@ -20,6 +21,8 @@ process is that of the system. Cores: those the process may use (taskset).
 
 import argparse
 import resource
+from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.timing import cpu_model, num_cores, timed, versions
 from jaxreg import Status
-from jaxreg.averaging import Correntropy, PoseGraphLM, average
+from jaxreg.averaging import AveragingSolution, Correntropy, PoseGraphLM, average
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_errors, translation_errors
 
@@ -105,6 +108,17 @@ def memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
+def in_turn() -> Callable[[PoseGraph], AveragingSolution]:
+    """`average` of one graph after the other, on each device of its own share."""
+    each = partial(jax.lax.map, average)
+    over = jax.sharding.PartitionSpec("graph")
+    kind = (jax.sharding.AxisType.Auto,)
+    mesh = jax.make_mesh((jax.device_count(),), ("graph",), axis_types=kind)
+    return jax.jit(
+        jax.shard_map(each, mesh=mesh, in_specs=over, out_specs=over, check_vma=False)
+    )
+
+
 def batch(num: int, side_by_side: bool, seed: int) -> None:
     """Prints the rate of one call on many graphs."""
     rng = np.random.default_rng(seed)
@@ -118,8 +132,7 @@ def batch(num: int, side_by_side: bool, seed: int) -> None:
         information=None,
         num_poses=N,
     )
-    in_turn = jax.jit(lambda g: jax.lax.map(average, g))
-    many = jax.jit(jax.vmap(average)) if side_by_side else in_turn
+    many = jax.jit(jax.vmap(average)) if side_by_side else in_turn()
     first = timed(lambda: jax.block_until_ready(many(graphs))).wall
     solution, cpu, seconds = timed(lambda: jax.block_until_ready(many(graphs)))
     found, true = solution.T_world_i, jnp.asarray(X, jnp.float32)

@@ -10,11 +10,12 @@ edges, preconditioned by a multigrid cycle. Any numbering of frames is right.
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxreg.averaging.krylov import conjugate_gradients
-from jaxreg.averaging.multigrid import anchored, multigrid, ridged_inverse
+from jaxreg.averaging.multigrid import anchored, multigrid, ridged_factor
 
 
 #: Largest number of frames for which a dense matrix over frames is formed.
@@ -84,8 +85,16 @@ def solve_laplacian(
 
 
 def _direct(edges: Array, weight: Array, num_poses: int) -> Callable[[Array], Array]:
-    inverse = ridged_inverse(laplacian(edges, weight, num_poses))
-    return lambda rhs: inverse @ rhs.at[0].set(0)
+    factor, root = ridged_factor(laplacian(edges, weight, num_poses))
+    root = root[:, None]
+
+    # Not by an inverse: with many right-hand sides BLAS starts threads, which take
+    # longer to meet than to work.
+    def solve(rhs: Array) -> Array:
+        half = root * rhs.at[0].set(0)
+        return root * jax.scipy.linalg.cho_solve((factor, True), half)
+
+    return solve
 
 
 def _iterative(

@@ -162,15 +162,21 @@ def matmul(A: Float[Array, "v a b"], x: Float[Array, "v b c"]) -> Float[Array, "
 
 def ridged_inverse(A: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     """Inverses of semidefinite matrices whose empty rows are left alone."""
-    n = A.shape[-1]
+    factor, root = ridged_factor(A)
+    eyes = jnp.broadcast_to(jnp.eye(A.shape[-1], dtype=A.dtype), A.shape)
+    half = jax.lax.linalg.triangular_solve(factor, eyes, left_side=True, lower=True)
+    inverse = jnp.swapaxes(half, -1, -2) @ half
+    return inverse * root[..., :, None] * root[..., None, :]
+
+
+def ridged_factor(
+    A: Float[Array, "*b n n"],
+) -> tuple[Float[Array, "*b n n"], Float[Array, "*b n"]]:
+    """L and s with A close to diag(1 / s) L L' diag(1 / s), for the same matrices."""
     diagonal = jnp.diagonal(A, axis1=-2, axis2=-1)
     # A unit diagonal first, so that parts in other units keep their digits.
     root = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
     scaled = A * root[..., :, None] * root[..., None, :]
-    eye = jnp.eye(n, dtype=A.dtype)
+    eye = jnp.eye(A.shape[-1], dtype=A.dtype)
     ridge = jnp.where(diagonal > 0, 30 * jnp.finfo(A.dtype).eps, 1)
-    factor = jnp.linalg.cholesky(scaled + ridge[..., None] * eye)
-    eyes = jnp.broadcast_to(eye, A.shape)
-    half = jax.lax.linalg.triangular_solve(factor, eyes, left_side=True, lower=True)
-    inverse = jnp.swapaxes(half, -1, -2) @ half
-    return inverse * root[..., :, None] * root[..., None, :]
+    return jnp.linalg.cholesky(scaled + ridge[..., None] * eye), root
