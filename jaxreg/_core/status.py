@@ -59,7 +59,8 @@ _ADVICE = {
         "Start nearer, use a robust kernel, or search with ParticleFilter."
     ),
     Status.DISCONNECTED: (
-        "The trusted edges do not reach every pose. See `placed`; poses that are not "
-        "placed are meaningless. Add edges or scans that bridge the parts."
+        "The trusted edges do not reach every pose. See `placed`, and `component` "
+        "where there is one: other poses are meaningless or in a frame of their own. "
+        "Add edges or scans that bridge the parts."
     ),
 }

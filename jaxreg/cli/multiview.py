@@ -16,7 +16,7 @@ from jaxreg.cli.runtime import Options, Session
 from jaxreg.io.atomic import require_writable
 from jaxreg.io.errors import InputError
 from jaxreg.io.pair_log import PairLog, Pairs
-from jaxreg.io.result import Result, version
+from jaxreg.io.result import Result, file_of, version
 from jaxreg.io.stanford import read_conf
 
 
@@ -119,14 +119,15 @@ def reconstruct_scans(
         progress=progress,
         on_pairs=None if log is None else lambda m: log.add(_pairs(m)),
     )
-    placed, keep = np.asarray(sol.placed), np.asarray(sol.graph.mask)
-    world = middles[np.argmax(placed)]  # the frame of the first placed scan
+    component, keep = np.asarray(sol.component), np.asarray(sol.graph.mask)
+    # The frame of a component's first scan; that of a scan alone means nothing.
+    first = np.argmax(component[:, None] == component, axis=1)
     edges = np.asarray(sol.graph.edges)[keep]
     i, j = edges.T
     return Result(
         names=scans.names,
-        T_world_i=outputs.uncentre(np.asarray(sol.T_world_i), world, middles),
-        placed=placed,
+        T_world_i=outputs.uncentre(np.asarray(sol.T_world_i), middles[first], middles),
+        component=component,
         status=Status(int(sol.status)),
         scan_status=np.asarray(sol.scan_status),
         num_points=np.array([len(x) for x in scans.points]),
@@ -200,7 +201,13 @@ def report(
     outputs.show_scans(session, result)
     if errors is not None:
         outputs.show_errors(session, errors)
-    outputs.show_end(session, FILES, session.options.out)
+    per_component = ("poses.tum", "graph.g2o", "merged.ply")
+    more = [
+        file_of(name, k)
+        for k in range(1, result.num_components)
+        for name in per_component
+    ]
+    outputs.show_end(session, [*FILES, *more], session.options.out)
 
 
 def _read_truth(path: Path, scans: Scans) -> tuple[list[str], np.ndarray]:

@@ -164,7 +164,7 @@ def show_scans(session: Session, result: Result) -> None:
             name,
             f"{result.num_points[i]:,}",
             f"{result.num_dropped[i]:,}",
-            status if result.placed[i] else f"{status}, not placed",
+            status + _whereabouts(int(result.component[i])),
             pair,
             overlap,
         )
@@ -174,8 +174,19 @@ def show_scans(session: Session, result: Result) -> None:
         f"{result.status.name}: {int(result.placed.sum())} of {len(result.names)} "
         f"scans placed, {trusted} of {len(result.edges)} pairs trusted."
     )
+    for k in range(1, result.num_components):
+        session.console.print(
+            f"Component {k}: {int(np.sum(result.component == k))} scans that fit each "
+            "other, but not the others: a model of its own."
+        )
     if result.status != Status.CONVERGED:
         session.console.print(result.status.advice)
+
+
+def _whereabouts(component: int) -> str:
+    if component < 0:
+        return ", not placed"
+    return f", component {component}" if component else ""
 
 
 def show_errors(session: Session, errors: dict[str, Any]) -> None:

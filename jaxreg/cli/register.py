@@ -72,7 +72,7 @@ def _register(
     result = Result(
         names=scans.names,
         T_world_i=np.stack([np.eye(len(T_target_source[0])), T_target_source[0]]),
-        placed=np.array([True, found]),
+        component=np.where([True, found], 0, -1),
         status=status,
         scan_status=np.array([Status.CONVERGED, status]),
         num_points=rows,

@@ -1,4 +1,4 @@
-"""The files of a result: result.json, poses.tum, graph.g2o, merged.ply.
+"""The files of a result: result.json, and of each component poses, graph, points.
 
 A `Result` is what a reconstruction or registration found, on the host and in float64,
 in the frames and unit of the files that were read.
@@ -37,8 +37,9 @@ class Result:
 
     Attributes:
         names: of the `v` scans.
-        T_world_i: `(v, d+1, d+1)` float64 poses.
-        placed: `(v,)` False where the pose means nothing.
+        T_world_i: `(v, d+1, d+1)` float64 poses, in a frame of each component's own.
+        component: `(v,)` number of each scan's component: 0 is the model, others are
+            models of their own, -1 means that the pose means nothing.
         status: of the whole.
         scan_status: `(v,)` of each scan.
         num_points: `(v,)` rows read.
@@ -52,7 +53,7 @@ class Result:
 
     names: list[str]
     T_world_i: np.ndarray
-    placed: np.ndarray
+    component: np.ndarray
     status: Status
     scan_status: np.ndarray
     num_points: np.ndarray
@@ -62,6 +63,16 @@ class Result:
     overlap: np.ndarray
     weight: np.ndarray
     inlier_rmse: np.ndarray
+
+    @property
+    def placed(self) -> np.ndarray:
+        """`(v,)` the scans of the model, component 0."""
+        return self.component == 0
+
+    @property
+    def num_components(self) -> int:
+        """At least one."""
+        return int(self.component.max(initial=0)) + 1
 
     def best_pair(self, scan: int) -> int | None:
         """The row of the pair of this scan that overlaps most, None without pairs."""
@@ -99,7 +110,7 @@ def result_document(
         "names": result.names,
         "T_world_i": [
             T.tolist() if ok else None
-            for T, ok in zip(result.T_world_i, result.placed, strict=True)
+            for T, ok in zip(result.T_world_i, result.component >= 0, strict=True)
         ],
         "scans": [_scan_entry(result, i) for i in range(len(result.names))],
         "pairs": [_pair_entry(result, e) for e in range(len(result.edges))],
@@ -126,9 +137,10 @@ def write_result(
 ) -> None:
     """Writes result.json, poses.tum, graph.g2o and merged.ply into an existing folder.
 
-    Scans that are not placed are in result.json alone. In poses.tum the timestamp, in
-    graph.g2o the id is the number of the scan. graph.g2o holds the pairs that are
-    trusted, the information being the trust times the identity.
+    Components beside the model have files of their own, see `file_of`; scans alone are
+    in result.json only. In poses.tum the timestamp, in graph.g2o the id is the number
+    of the scan. graph.g2o holds the pairs that are trusted, the information being the
+    trust times the identity.
 
     Raises:
         InputError: if a file cannot be written.
@@ -136,15 +148,24 @@ def write_result(
     """
     folder = Path(folder)
     write_json(folder / "result.json", document)
-    points, owner = merge_scans(scans, result.T_world_i, result.placed)
-    colors = scan_colors(len(scans))[owner]
-    write_ply(folder / "merged.ply", points, colors)
-    ids = np.flatnonzero(result.placed)
-    # Files keep the digits of float64 whatever the precision of the computation.
-    with jax.enable_x64(True):
-        T_world_i = jnp.asarray(result.T_world_i[ids])
-        write_tum(folder / "poses.tum", T_world_i, timestamps=ids)
-        write_g2o(folder / "graph.g2o", _trusted_graph(result, ids), T_world_i, ids)
+    for k in range(result.num_components):
+        member = result.component == k
+        points, owner = merge_scans(scans, result.T_world_i, member)
+        colors = scan_colors(len(scans))[owner]
+        write_ply(folder / file_of("merged.ply", k), points, colors)
+        ids = np.flatnonzero(member)
+        graph = _trusted_graph(result, ids)
+        # Files keep the digits of float64 whatever the precision of the computation.
+        with jax.enable_x64(True):
+            T_world_i = jnp.asarray(result.T_world_i[ids])
+            write_tum(folder / file_of("poses.tum", k), T_world_i, timestamps=ids)
+            write_g2o(folder / file_of("graph.g2o", k), graph, T_world_i, ids)
+
+
+def file_of(name: str, component: int) -> str:
+    """The name of a component's file: merged.ply, merged_1.ply, ..."""
+    stem, _, suffix = name.rpartition(".")
+    return f"{stem}_{component}.{suffix}" if component else name
 
 
 def merge_scans(
@@ -203,6 +224,7 @@ def _scan_entry(result: Result, i: int) -> dict[str, Any]:
     return {
         "name": result.names[i],
         "placed": bool(result.placed[i]),
+        "component": int(result.component[i]),
         "status": status.name,
         "advice": status.advice,
         "num_points": int(result.num_points[i]),

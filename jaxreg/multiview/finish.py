@@ -49,16 +49,18 @@ def _solution(
     found = motions.in_input_frames(scans)
     real = motions.pairs[:, 0] != motions.pairs[:, 1]
     graph = PoseGraph(found.pairs, found.T_i_j, weight, real, None, scans.num_scans)
-    placed = placement.placed
-    scan_status = jnp.where(placed, Status.CONVERGED, Status.LOW_OVERLAP)
+    component, placed = placement.component, placement.placed
+    scan_status = jnp.where(component < 0, Status.LOW_OVERLAP, Status.DISCONNECTED)
+    scan_status = jnp.where(placed, Status.CONVERGED, scan_status)
     scan_status = jnp.where(scans.enough, scan_status, Status.TOO_FEW_POINTS)
     return ReconstructionSolution(
-        T_world_i=_in_first_frame(scans, placement),
+        T_world_i=_in_first_frames(scans, placement),
         status=jnp.where(jnp.all(placed), Status.CONVERGED, Status.DISCONNECTED).astype(
             jnp.int32
         ),
         scan_status=scan_status.astype(jnp.int32),
         placed=placed,
+        component=component,
         graph=graph,
         overlap=motions.overlap,
         edge_weight=_trust(scans, motions, placement, weight),
@@ -75,7 +77,7 @@ def _trust(
 ) -> Float[Array, " e"]:
     """Agreement of the pairs' motions with the poses; the centred radius is one."""
     i, j = motions.pairs[:, 0], motions.pairs[:, 1]
-    T_world_i, placed = placement.T_world_i, placement.placed
+    T_world_i = placement.T_world_i
     T_error = lie.inverse(T_world_i[i]) @ T_world_i[j] @ lie.inverse(motions.T_i_j)
     turn = lie.rotation_angle(lie.rotation(T_error))
     centre = lie.translation(lie.inverse(T_world_i[i]) @ T_world_i[j])
@@ -83,17 +85,16 @@ def _trust(
     sq = turn**2 + jnp.sum(shift**2, axis=-1)
     spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
     trust = jnp.exp(-sq / (2 * jnp.maximum(spacing, 1e-6) ** 2))
-    return jnp.where((weight > 0) & placed[i] & placed[j], trust, 0)
+    return jnp.where((weight > 0) & placement.together(i, j), trust, 0)
 
 
-def _in_first_frame(
+def _in_first_frames(
     scans: PreparedScans, placement: Placement
 ) -> Float[Array, "v D D"]:
-    """Poses relative to the first placed scan, in the input's frames and unit."""
-    first = jnp.argmax(placement.placed).astype(jnp.int32)
+    """Poses relative to the first scan of each part, in the input's frames and unit."""
+    first = placement.part
     ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
     T_first_i = lie.inverse(placement.T_world_i[first]) @ placement.T_world_i
-    T = scans.to_input_frames(T_first_i, jnp.full_like(ids, first), ids)
+    T = scans.to_input_frames(T_first_i, first, ids)
     eye = jnp.eye(T.shape[-1], dtype=T.dtype)
-    keep = placement.placed & (ids != first)
-    return jnp.where(keep[:, None, None], T, eye)
+    return jnp.where((ids != first)[:, None, None], T, eye)

@@ -28,18 +28,41 @@ class Placement(eqx.Module):
     """Poses of the centred frames, and what they rest on.
 
     Attributes:
-        T_world_i: `(v, d+1, d+1)`.
-        placed: `(v,)` the largest part.
-        part: `(v,)` int32, the same for scans that hang together.
+        T_world_i: `(v, d+1, d+1)`, the world being one of each part's own.
+        part: `(v,)` int32, the lowest number of the scans that each hangs together
+            with, of a scan alone its own.
         edge_weight: `(e,)` trust in each pair.
         status: of the averaging.
     """
 
     T_world_i: Float[Array, "v D D"]
-    placed: Bool[Array, " v"]
     part: Int[Array, " v"]
     edge_weight: Float[Array, " e"]
     status: StatusArray
+
+    @property
+    def component(self) -> Int[Array, " v"]:
+        """`(v,)` number of each scan's part, the largest first; -1 of scans alone.
+
+        Where every scan is alone, the first of them is the largest part.
+        """
+        size = part_sizes(self.part)
+        ids = jnp.arange(len(size), dtype=jnp.int32)
+        first = self.part == ids
+        larger = size[None, :] > size[:, None]
+        same = size[None, :] == size[:, None]
+        before = larger | (same & (self.part[None, :] < self.part[:, None]))
+        number = jnp.sum(first[None, :] & before, axis=1).astype(jnp.int32)
+        return jnp.where((size > 1) | (number == 0), number, -1)
+
+    @property
+    def placed(self) -> Bool[Array, " v"]:
+        """`(v,)` the scans of the largest part."""
+        return self.component == 0
+
+    def together(self, i: Int[Array, "*b"], j: Int[Array, "*b"]) -> Bool[Array, "*b"]:
+        """Whether scans i and j are of one part."""
+        return self.part[i] == self.part[j]
 
 
 @compiled
@@ -51,31 +74,48 @@ def place(
 ) -> Placement:
     """Averages the pairs that overlap; the world is the frame of the root.
 
-    The root is the scan of lowest number in the largest connected set of scans, so
-    that one scan that fits nowhere does not take the others with it. Overlap is
-    evidence of its own, so averaging starts from the spanning tree of largest overlap.
+    The root is the scan of lowest number in the largest connected set of scans. The
+    other sets of two and more are averaged with it, each hung on it by one motion of no
+    consequence. Overlap is evidence of its own, so averaging starts from the spanning
+    tree of largest overlap.
     """
     if averaging is None:
         averaging = Correntropy(initialiser=SpanningTree())
     pairs = motions.pairs
     trusted = jnp.where(motions.overlap >= min_overlap, motions.overlap, 0)
     label = components(pairs, trusted, num_scans)
-    size = jnp.sum(label[:, None] == label[None, :], axis=1)
+    size = part_sizes(label)
     root = jnp.argmax(size).astype(jnp.int32)
+    ids = jnp.arange(num_scans, dtype=jnp.int32)
+    hung = (label == ids) & (size > 1) & (ids != root)
     # Averaging fixes frame 0: swap the root's number with 0.
-    swap = jnp.arange(num_scans, dtype=jnp.int32).at[root].set(0).at[0].set(root)
+    swap = ids.at[root].set(0).at[0].set(root)
     graph = PoseGraph(swap[pairs], motions.T_i_j, trusted, trusted > 0, None, num_scans)
-    solution = average(graph, averaging)
-    edge_weight = solution.edge_weight * (trusted > 0)
+    solution = average(_with_hung(graph, hung[swap], min_overlap), averaging)
+    edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
     agreed = jnp.where(believed(edge_weight), trusted, 0)
+    agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
     label = _confirmed_components(pairs, agreed, num_scans, _STRONG * min_overlap)
-    # Averaging made the largest set of candidates the world; the largest confirmed
-    # part of it is what is placed.
-    size = jnp.sum(label[:, None] == label[None, :], axis=1)
-    size = jnp.where(solution.placed[swap], size, 0)
-    placed = label == label[jnp.argmax(size)]
-    return Placement(
-        solution.T_world_i[swap], placed, label, edge_weight, solution.status
+    return Placement(solution.T_world_i[swap], label, edge_weight, solution.status)
+
+
+def part_sizes(part: Int[Array, " v"]) -> Int[Array, " v"]:
+    """How many scans are of each scan's part."""
+    return jnp.sum(part[:, None] == part[None, :], axis=1)
+
+
+def _with_hung(graph: PoseGraph, hung: Bool[Array, " v"], weight: Scalar) -> PoseGraph:
+    """With a motion from frame 0 to each frame of `hung`: none contradicts it."""
+    num, D = hung.shape[0], graph.T_i_j.shape[-1]
+    ids = jnp.where(hung, jnp.arange(num, dtype=jnp.int32), 0)
+    eye = jnp.broadcast_to(jnp.eye(D, dtype=graph.T_i_j.dtype), (num, D, D))
+    return PoseGraph(
+        jnp.concatenate([graph.edges, jnp.stack([jnp.zeros_like(ids), ids], axis=1)]),
+        jnp.concatenate([graph.T_i_j, eye]),
+        jnp.concatenate([graph.weight, jnp.where(hung, weight, 0)]),
+        jnp.concatenate([graph.mask, hung]),
+        None,
+        num,
     )
 
 

@@ -11,7 +11,7 @@ are not noise but warps, which the median of many pairs evens out.)
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.typing import Motion, Scalar
@@ -25,7 +25,7 @@ from jaxreg.local import (
     mutual_overlap,
     score,
 )
-from jaxreg.multiview.place import Placement, place
+from jaxreg.multiview.place import Placement, part_sizes, place
 from jaxreg.multiview.relative import RelativeMotions
 from jaxreg.multiview.scans import PreparedScans
 from jaxreg.neighbours import exact_index
@@ -47,13 +47,13 @@ def refine(
 
     Args:
         scans: prepared scans.
-        placement: poses of the centred frames, and which scans are placed.
+        placement: poses of the centred frames, and which scans hang together.
         averaging: None for the MCC paper's `Correntropy`.
         min_overlap: of the pairs that count.
 
     Returns:
-        The placement by these pairs. Scans that are not placed keep their poses, and so
-        do those that no pair holds any more.
+        The placement by these pairs. Scans that no pair holds any more keep their
+        poses, but are alone.
     """
     if averaging is None:
         # No outliers are left: the paper's wider kernel takes more pairs in.
@@ -67,13 +67,22 @@ def refine(
 
 @eqx.filter_jit
 def _updated(before: Placement, after: Placement) -> Placement:
-    """The later poses of the scans that both hold, in the earlier frame."""
-    held = before.placed & after.placed
-    one = jnp.argmax(held)
-    T_before_after = before.T_world_i[one] @ lie.inverse(after.T_world_i[one])
-    T = T_before_after @ after.T_world_i
+    """The later poses of the scans that both hold, in the earlier frames.
+
+    Of each earlier part, the largest of the later parts in it is held.
+    """
+    ids = jnp.arange(before.part.shape[0], dtype=jnp.int32)
+    same = before.part[:, None] == before.part[None, :]
+    size = part_sizes(after.part)
+    rank = jnp.where(same, size[None, :], 0)
+    chosen = after.part[jnp.argmax(rank, axis=1)]
+    held = (after.part == chosen) & (part_sizes(before.part) > 1)
+    first = jnp.argmax(same & held[None, :], axis=1).astype(jnp.int32)
+    first = jnp.where(held, first, ids)
+    T_before_after = before.T_world_i @ lie.inverse(after.T_world_i)
+    T = T_before_after[first] @ after.T_world_i
     T = jnp.where(held[:, None, None], T, before.T_world_i)
-    return eqx.tree_at(lambda p: (p.T_world_i, p.placed), before, (T, held))
+    return eqx.tree_at(lambda p: (p.T_world_i, p.part), before, (T, first))
 
 
 # Not `compiled`: the older generator takes minutes and 13 GB over the exact search.
@@ -81,9 +90,9 @@ def _updated(before: Placement, after: Placement) -> Placement:
 def _measured(
     scans: PreparedScans, placement: Placement, min_overlap: Scalar, *, exact: bool
 ) -> RelativeMotions:
-    """The motion and overlap of every pair of placed scans near the present poses."""
-    T_world_i, placed = placement.T_world_i, placement.placed
-    spacing = jnp.max(jnp.where(placed, scans.spacing, 0))
+    """The motion and overlap of every pair of a part near the present poses."""
+    T_world_i, alone = placement.T_world_i, part_sizes(placement.part) == 1
+    spacing = jnp.max(jnp.where(alone, 0, scans.spacing))
     widths = spacing * jnp.asarray(_EXACT_WIDTHS if exact else _TABLE_WIDTHS)
     optimiser = LocalOptimiser(PlaneToPlane(0.01), GemanMcClure(), GaussNewton())
     optimiser = cast_floats(optimiser, T_world_i.dtype)
@@ -99,17 +108,14 @@ def _measured(
         T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
         there = score(_problem(scans, i, j), T_i_j, spacing)
         back = score(_problem(scans, j, i), lie.inverse(T_i_j), spacing)
-        overlap = jnp.where(_both(placed, pair), mutual_overlap(there, back), 0)
+        overlap = mutual_overlap(there, back)
+        overlap = jnp.where(placement.together(i, j), overlap, 0)
         T_i_j = lax.cond(overlap >= min_overlap, measured, lambda _: T_i_j, pair)
         return T_i_j, overlap
 
     pairs = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
     T_i_j, overlap = lax.map(one, pairs)
     return RelativeMotions(pairs, T_i_j, overlap, jnp.zeros_like(overlap))
-
-
-def _both(placed: Bool[Array, " v"], pair: Array) -> Bool[Array, ""]:
-    return placed[pair[0]] & placed[pair[1]]
 
 
 def _problem(scans: PreparedScans, i: Array, j: Array, exact: bool = False) -> Problem:

@@ -145,7 +145,7 @@ def _prospects(
         T_i_j = lie.inverse(T[i]) @ T[j]
         problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
         return lax.cond(
-            found.placed[i] & found.placed[j],
+            found.together(i, j),
             lambda: score(problem, T_i_j, spacing).fitness,
             lambda: jnp.zeros_like(spacing),
         )

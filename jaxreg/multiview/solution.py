@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import is_concrete
@@ -16,20 +17,22 @@ class ReconstructionSolution(eqx.Module):
     """One pose per scan, and every pair that was tried.
 
     Attributes:
-        T_world_i: `(v, d+1, d+1)` maps scan i to the world, which is the frame of scan
-            0, or of the first placed scan if scan 0 could not be placed. Identity for
-            scans that are not placed.
+        T_world_i: `(v, d+1, d+1)` maps scan i to the world of its component, which is
+            the frame of the component's first scan. Identity for scans alone.
         status: int32; CONVERGED if every scan is placed, else DISCONNECTED.
-        scan_status: `(v,)` int32; CONVERGED, TOO_FEW_POINTS, or LOW_OVERLAP for scans
-            that could not be placed.
-        placed: `(v,)`.
+        scan_status: `(v,)` int32; CONVERGED where placed, DISCONNECTED in another
+            component, LOW_OVERLAP or TOO_FEW_POINTS for scans that join no other.
+        placed: `(v,)` the scans of component 0.
+        component: `(v,)` int32, the scans that trusted pairs join have one number: 0 is
+            the component of most scans, -1 stands for scans alone. Nothing is known
+            of how two components lie.
         graph: every pair that was registered, `T_i_j` in the input's frames and unit,
             prior weight the overlap where it is trusted and else 0.
         overlap: `(e,)` see `RegistrationSolution`.
         edge_weight: `(e,)` trust, 0 to 1: how well the pair's own motion agrees with
             the final poses, by a Gaussian of the displacement of the scan whose width
-            is the sample spacing; 0 where the overlap is too small or a scan is not
-            placed.
+            is the sample spacing; 0 where the overlap is too small or the scans are
+            of two components.
         inlier_rmse: `(e,)` distance of that share, in the unit of the input.
         num_dropped: `(v,)` rows that were not finite.
     """
@@ -38,6 +41,7 @@ class ReconstructionSolution(eqx.Module):
     status: StatusArray
     scan_status: Int[Array, " v"]
     placed: Bool[Array, " v"]
+    component: Int[Array, " v"]
     graph: PoseGraph
     overlap: Float[Array, " e"]
     edge_weight: Float[Array, " e"]
@@ -68,12 +72,15 @@ class ReconstructionSolution(eqx.Module):
         return eqx.tree_at(pairs_of, self, parts)
 
     def __repr__(self) -> str:
-        """One line: status, scans placed, pairs trusted."""
+        """One line: status, scans placed, other components, pairs trusted."""
         if not is_concrete(self.status) or self.status.ndim:
             return f"ReconstructionSolution(T_world_i {self.T_world_i.shape})"
+        others = np.bincount(np.asarray(self.component) + 1)[2:]
+        more = f", apart from them {' and '.join(map(str, others))}"
         return (
             f"ReconstructionSolution({Status(int(self.status)).name}, "
-            f"{int(jnp.sum(self.placed))} of {self.placed.size} scans placed, "
+            f"{int(jnp.sum(self.placed))} of {self.placed.size} scans placed"
+            f"{more if len(others) else ''}, "
             f"{int(jnp.sum(self.edge_weight > 0.5))} of {self.overlap.size} pairs "
             "trusted)"
         )

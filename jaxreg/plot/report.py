@@ -186,13 +186,14 @@ def _result(
     if isinstance(solution, jaxreg.RegistrationSolution):
         T = np.asarray(solution.T_target_source, np.float64)
         found = status in (Status.CONVERGED, Status.MAX_STEPS, Status.AMBIGUOUS)
-        poses, placed = np.stack([np.eye(len(T)), T]), np.array([True, found])
+        poses = np.stack([np.eye(len(T)), T])
+        component = np.where([True, found], 0, -1)
         scan_status = np.array([Status.CONVERGED, status])
         edges, T_i_j, keep = np.array([[0, 1]]), T[None], slice(None)
         weight = np.array([float(found)])
     else:
         poses = np.asarray(solution.T_world_i, np.float64)
-        placed = np.asarray(solution.placed)
+        component = np.asarray(solution.component)
         scan_status = np.asarray(solution.scan_status)
         keep = np.asarray(solution.graph.mask)
         edges = np.asarray(solution.graph.edges)[keep]
@@ -202,7 +203,7 @@ def _result(
     return Result(
         names=labels,
         T_world_i=poses,
-        placed=placed,
+        component=component,
         status=status,
         scan_status=scan_status,
         num_points=size,

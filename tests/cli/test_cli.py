@@ -46,7 +46,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def _fake_reconstruct(
-    monkeypatch: pytest.MonkeyPatch, T_true: np.ndarray, placed: list[bool]
+    monkeypatch: pytest.MonkeyPatch,
+    T_true: np.ndarray,
+    placed: list[bool],
+    component: list[int] | None = None,
 ) -> list[Any]:
     """A solver that knows the poses of the centred scans; returns what it was given."""
     given: list[Any] = []
@@ -71,6 +74,7 @@ def _fake_reconstruct(
             status=jnp.asarray(0 if all(placed) else Status.DISCONNECTED),
             scan_status=jnp.asarray([0 if p else lost for p in placed]),
             placed=jnp.asarray(placed),
+            component=jnp.asarray(component or np.where(placed, 0, -1)),
             graph=graph,
             overlap=jnp.asarray(np.where(both, 0.8, 0.1)),
             edge_weight=jnp.asarray(both.astype(float)),
@@ -206,6 +210,27 @@ def test_a_lost_scan_is_reported_and_the_others_are_written(
     assert found["T_world_i"][2] is None
     assert found["scans"][2]["best_pair"]["overlap"] == pytest.approx(0.1)
     assert len(read_points("deep/er/merged.ply")) == 80
+
+
+def test_a_second_object_is_a_model_of_its_own(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder) + ["t0.npy", "t1.npy"]
+    shutil.copy("s0.npy", "t0.npy")
+    shutil.copy("s1.npy", "t1.npy")
+    poses = POSES[[0, 1, 2, 0, 1]]
+    _fake_reconstruct(monkeypatch, poses, [True] * 3 + [False] * 2, [0, 0, 0, 1, 1])
+    assert main(["multiview", *scans]) == 0
+    text = capsys.readouterr().out
+    assert "component 1" in text
+    assert "Component 1: 2 scans that fit each other" in text
+    assert "merged_1.ply" in text
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    assert [scan["component"] for scan in found["scans"]] == [0, 0, 0, 1, 1]
+    own = read_points("jaxreg-out/merged_1.ply")
+    # In the frame of t0.npy, the first scan of its component.
+    np.testing.assert_allclose(own[:40], _seen_from(POSES[0]), atol=1e-5)
+    np.testing.assert_allclose(own[40:], own[:40], atol=1e-5)
 
 
 def test_scans_without_overlap_are_named_and_nothing_is_written(

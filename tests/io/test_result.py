@@ -1,3 +1,4 @@
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ def _result(offset: float = 0.0, d: int = 3) -> tuple[Result, list[np.ndarray]]:
     result = Result(
         names=["a", "b", "c"],
         T_world_i=T,
-        placed=np.array([True, True, False]),
+        component=np.array([0, 0, -1]),
         status=Status.DISCONNECTED,
         scan_status=np.array([0, 0, Status.LOW_OVERLAP]),
         num_points=np.array([30, 30, 10]),
@@ -89,6 +90,32 @@ def test_poses_graph_and_model_agree_also_far_from_the_origin(tmp_path: Path):
     assert merged.shape == (60, 3)
     # Both scans are of the same points, so they coincide in the common frame.
     np.testing.assert_allclose(merged[:30], merged[30:], atol=1e-8)
+
+
+def test_another_component_is_a_model_of_its_own(tmp_path: Path):
+    result, scans = _result()
+    both = dataclasses.replace(
+        result,
+        names=list("abcde"),
+        component=np.array([0, 1, -1, 1, 0]),
+        T_world_i=result.T_world_i[[0, 0, 2, 1, 1]],
+        scan_status=np.array([0, Status.DISCONNECTED, 3, Status.DISCONNECTED, 0]),
+        num_points=np.full(5, 30),
+        num_dropped=np.zeros(5, int),
+        edges=np.array([[0, 4], [1, 3], [0, 1]]),
+        T_i_j=result.T_i_j[[0, 0, 1]],
+        weight=np.array([0.9, 0.8, 0.0]),
+    )
+    scans = [scans[k] for k in (0, 0, 2, 1, 1)]
+    found = _write(tmp_path, both, scans)
+    assert [scan["component"] for scan in found["scans"]] == [0, 1, -1, 1, 0]
+    assert [scan["placed"] for scan in found["scans"]] == [True, *[False] * 3, True]
+    assert [T is None for T in found["T_world_i"]] == [False, False, True, False, False]
+    for name, ids in (("", [0, 4]), ("_1", [1, 3])):
+        assert read_tum(tmp_path / f"poses{name}.tum")[0].tolist() == ids
+        assert read_g2o_poses(tmp_path / f"graph{name}.g2o")[0].tolist() == ids
+        merged = read_points(tmp_path / f"merged{name}.ply")
+        np.testing.assert_allclose(merged[:30], merged[30:], atol=1e-8)
 
 
 def test_2d_results_are_written(tmp_path: Path):

@@ -165,6 +165,29 @@ def test_bad_scans_are_reported_and_the_others_placed(sculpture):
         assert pose_error(sol.T_world_i[i], T_true)[0] < 0.03
 
 
+def test_two_objects_make_two_components(sculpture):
+    scans, truth = sculpture
+    # Views of a second object in place of the last three.
+    other = 0.1 * blob(5000, 3)
+    mixed, poses = list(scans), truth.copy()
+    for i, view in enumerate([[1, 0, 0], [0.8, 0.6, 0], [0.6, 0, 0.8]], start=5):
+        poses[i] = motion(i, 3)
+        seen = other[other @ np.array(view) > -0.02]
+        mixed[i] = move(np.linalg.inv(poses[i]), seen[:2900])
+    sol = jr.reconstruct(mixed, key=jax.random.key(0), method=FILTER)
+    assert "5 of 8 scans placed, apart from them 3" in repr(sol)
+    assert int(sol.status) == Status.DISCONNECTED
+    np.testing.assert_array_equal(sol.component, [0] * 5 + [1] * 3)
+    np.testing.assert_array_equal(sol.placed, [True] * 5 + [False] * 3)
+    np.testing.assert_array_equal(sol.scan_status[5:], [Status.DISCONNECTED] * 3)
+    for i in range(8):
+        first = 5 if i >= 5 else 0
+        T_true = np.linalg.inv(poses[first]) @ poses[i]
+        angle, shift = pose_error(sol.T_world_i[i], T_true)
+        assert angle < 0.02
+        assert shift < 0.004
+
+
 def test_half_noise_leaves_all_scans_placed(sculpture):
     scans, truth = sculpture
     scans = [half_noise(x, seed) for seed, x in enumerate(scans)]

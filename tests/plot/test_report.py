@@ -37,7 +37,7 @@ def _result(d: int, v: int, names: list[str]) -> tuple[list[np.ndarray], Result]
     return scans, Result(
         names=names,
         T_world_i=T,
-        placed=np.ones(v, bool),
+        component=np.zeros(v, int),
         status=Status.CONVERGED,
         scan_status=np.zeros(v, int),
         num_points=np.array([len(x) for x in scans]),
@@ -109,7 +109,7 @@ def test_large_scans_are_thinned_and_small_ones_are_not(
 def test_scans_without_points_or_poses_do_not_break_the_page(tmp_path: Path):
     scans, result = _result(3, 3, list("abc"))
     scans[2] = np.full((5, 3), np.nan, np.float32)
-    result.placed[2] = False
+    result.component[2] = -1
     write_report(tmp_path / "a.html", scans, result)
     data = _data(tmp_path / "a.html")
     assert data["points"]["count"][2] == 0
