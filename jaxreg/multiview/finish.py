@@ -9,6 +9,7 @@ from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
+from jaxreg.multiview.hold import Held
 from jaxreg.multiview.place import Placement, place
 from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative import RelativeMotions
@@ -22,6 +23,7 @@ def finish(
     averaging: AbstractAverager | None,
     scans: PreparedScans,
     motions: RelativeMotions,
+    hold: Held | None = None,
 ) -> ReconstructionSolution:
     """Averages, refines, and returns to the frames and unit of the input.
 
@@ -30,11 +32,15 @@ def finish(
         averaging: see `place`.
         scans: prepared scans.
         motions: of pairs, in the scans' centred frames; some may be padding.
+        hold: old frames that stay, or None.
     """
     min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
     placement = place(motions, scans.num_scans, averaging, min_overlap)
     placement = refine(scans, placement, averaging, min_overlap / 2)
-    return _solution(scans, motions, placement, min_overlap)
+    if hold is None:
+        return _solution(scans, motions, placement, min_overlap)
+    placement = hold.place(scans, placement, averaging, min_overlap / 2)
+    return hold.in_world(_solution(scans, motions, placement, min_overlap))
 
 
 @compiled

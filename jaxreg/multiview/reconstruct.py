@@ -15,6 +15,7 @@ from jaxreg._core.checks import check_key, is_concrete
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.multiview.finish import finish
+from jaxreg.multiview.hold import Held
 from jaxreg.multiview.inputs import checked_viewpoints, padded_scans
 from jaxreg.multiview.plan import Order, all_pairs, first_pairs
 from jaxreg.multiview.relative import RelativeMotions, relative_motions
@@ -34,6 +35,7 @@ def reconstruct(
     viewpoints: object = None,
     order: Order | str = "any",
     previous: object = None,
+    hold_previous: bool = False,
     progress: Progress | None = None,
     on_pairs: OnPairs | None = None,
 ) -> ReconstructionSolution:
@@ -59,6 +61,9 @@ def reconstruct(
         previous: a `ReconstructionSolution` of the first of these scans, whose pairs
             are not registered again; or the `RelativeMotions` that `on_pairs` got in a
             run that was interrupted, which leads to the same answer. Not under `jit`.
+        hold_previous: whether the scans that are placed in the `previous` solution keep
+            the poses that they have there, to the last digit, and new ones lie beside
+            them in its world; else all poses are found anew.
         progress: called as `progress(stage, done, total)`; not under `jit`.
         on_pairs: called with the `RelativeMotions` of every few pairs as they are
             found, in the input's frames and unit; not under `jit`.
@@ -85,6 +90,11 @@ def reconstruct(
         raise TypeError(
             f"method: wanted a ParticleFilter, found {type(method).__name__}."
         )
+    if hold_previous and not isinstance(previous, ReconstructionSolution):
+        raise ValueError(
+            "hold_previous: wanted a ReconstructionSolution as previous, found "
+            f"{type(previous).__name__}."
+        )
     key = check_key(key)
     order = _checked(order)
     if not (is_concrete(points) and is_concrete(key)):
@@ -105,7 +115,11 @@ def reconstruct(
     rounds = Rounds(method, averaging, prepared, key, known, on_pairs, report)
     motions = rounds.run(order, first)
     report("averaging and refining", 0, 1)
-    solution = finish(method, averaging, prepared, motions.padded(rounds.most))
+    hold = None
+    if hold_previous and isinstance(previous, ReconstructionSolution):
+        hold = Held.of(previous, prepared.num_scans)
+    motions_padded = motions.padded(rounds.most)
+    solution = finish(method, averaging, prepared, motions_padded, hold)
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
     return solution.of_pairs(len(motions.overlap))

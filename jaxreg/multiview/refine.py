@@ -55,14 +55,19 @@ def refine(
         The placement by these pairs. Scans that no pair holds any more keep their
         poses, but are alone.
     """
-    if averaging is None:
-        # No outliers are left: the paper's wider kernel takes more pairs in.
-        averaging = Correntropy(width="paper", initialiser=SpanningTree())
+    averaging = wide_unless_given(averaging)
     for exact in (False, True):
-        motions = _measured(scans, placement, min_overlap, exact=exact)
+        motions = measured(scans, placement, min_overlap, exact=exact)
         again = place(motions, scans.num_scans, averaging, min_overlap)
         placement = _updated(placement, again)
     return placement
+
+
+def wide_unless_given(averaging: AbstractAverager | None) -> AbstractAverager:
+    """No outliers are left: the paper's wider kernel takes more pairs in."""
+    if averaging is None:
+        return Correntropy(width="paper", initialiser=SpanningTree())
+    return averaging
 
 
 @eqx.filter_jit
@@ -87,7 +92,7 @@ def _updated(before: Placement, after: Placement) -> Placement:
 
 # Not `compiled`: the older generator takes minutes and 13 GB over the exact search.
 @eqx.filter_jit
-def _measured(
+def measured(
     scans: PreparedScans, placement: Placement, min_overlap: Scalar, *, exact: bool
 ) -> RelativeMotions:
     """The motion and overlap of every pair of a part near the present poses."""

@@ -114,14 +114,20 @@ def test_an_interrupted_run_goes_on_to_the_same_answer(sculpture, solved):
     np.testing.assert_allclose(again.T_world_i, sol.T_world_i, atol=1e-5)
 
 
-def test_a_new_scan_joins_an_earlier_solution(sculpture, solved):
+@pytest.fixture(scope="module")
+def earlier(solved):
+    """The solution of the first seven scans."""
+    old = np.flatnonzero(np.max(solved[0].graph.edges, axis=1) < 7)
+    rows = {28: old, 8: np.arange(7)}
+
+    def of_seven(x):
+        return x[rows[len(x)]] if x.ndim and len(x) in rows else x
+
+    return jax.tree.map(of_seven, solved[0])
+
+
+def test_a_new_scan_joins_an_earlier_solution(sculpture, solved, earlier):
     sol, _, _ = solved
-    old = np.flatnonzero(np.max(sol.graph.edges, axis=1) < 7)
-    earlier = eqx.tree_at(
-        lambda s: (s.T_world_i, s.scan_status, s.placed, s.num_dropped),
-        jax.tree.map(lambda x: x[old] if x.shape[:1] == (28,) else x, sol),
-        (sol.T_world_i[:7], sol.scan_status[:7], sol.placed[:7], sol.num_dropped[:7]),
-    )
     new = []
     again = jr.reconstruct(
         sculpture[0],
@@ -133,6 +139,24 @@ def test_a_new_scan_joins_an_earlier_solution(sculpture, solved):
     pairs = np.concatenate([x.pairs for x in new])
     np.testing.assert_array_equal(pairs, [[i, 7] for i in range(7)])
     np.testing.assert_allclose(again.T_world_i, sol.T_world_i, atol=1e-5)
+
+
+def test_held_poses_stay_and_a_new_scan_lies_beside_them(sculpture, earlier):
+    turned = np.asarray(motion(3, 3), np.float32)
+    bent = eqx.tree_at(lambda s: s.T_world_i, earlier, turned @ earlier.T_world_i)
+    again = jr.reconstruct(
+        sculpture[0],
+        key=jax.random.key(0),
+        method=FILTER,
+        previous=bent,
+        hold_previous=True,
+    )
+    np.testing.assert_array_equal(again.T_world_i[:7], bent.T_world_i)
+    assert np.all(again.placed)
+    T_true = np.linalg.inv(sculpture[1][0]) @ sculpture[1][7]
+    angle, shift = pose_error(again.T_world_i[7], turned @ T_true)
+    assert angle < 0.02
+    assert shift < 0.004
 
 
 def test_a_sequence_takes_fewer_pairs(sculpture):
