@@ -31,6 +31,14 @@ class RelativeMotions(eqx.Module):
         """Some of them."""
         return jax.tree.map(lambda x: x[rows], self)
 
+    def or_better(self, others: list["RelativeMotions | None"]) -> "RelativeMotions":
+        """Where there is another motion of a pair that overlaps more, that one."""
+        out = self
+        for k, other in enumerate(others):
+            if other is not None and float(other.overlap[0]) > float(self.overlap[k]):
+                out = jax.tree.map(lambda x, y, k=k: x.at[k].set(y[0]), out, other)
+        return out
+
     def padded(self, num: int) -> "RelativeMotions":
         """With pairs of scan 0 and itself that do not overlap, to so many."""
         more = num - len(self.overlap)

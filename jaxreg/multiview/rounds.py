@@ -14,6 +14,7 @@ from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.geometry import lie
 from jaxreg.local import Problem, score
+from jaxreg.multiview.follow import SURE, descended_in_input_frames
 from jaxreg.multiview.place import Placement, believed, place
 from jaxreg.multiview.plan import Order, first_pairs, most_pairs, next_pairs
 from jaxreg.multiview.relative import RelativeMotions, relative_motions
@@ -59,6 +60,7 @@ class Rounds:
             self.row = {pair: row for row, pair in enumerate(ids)}
         self.tried = np.zeros((scans.num_scans,) * 2, bool)
         self.found: list[RelativeMotions] = []
+        self.rivals: dict[tuple[int, int], RelativeMotions] = {}
         self.most = most_pairs(scans.num_scans)
 
     def run(self, order: Order, pairs: np.ndarray | None) -> RelativeMotions:
@@ -72,6 +74,8 @@ class Rounds:
         rng = np.random.default_rng(bits)
         if pairs is None:
             pairs = first_pairs(self.scans.num_scans, order, rng)
+            if order == "sequential":
+                self._follow()
         self.most = max(self.most, len(pairs))
         while len(pairs):
             self._register(pairs)
@@ -106,16 +110,51 @@ class Rounds:
             rows = np.arange(start, start + _PAIRS_PER_BATCH)
             batch = jnp.asarray(pairs[np.minimum(rows, len(pairs) - 1)])
             out = relative_motions(self.method, self.scans, batch, self.key)
-            return jax.block_until_ready(out).rows(
+            out = jax.block_until_ready(out).rows(
                 jnp.arange(min(_PAIRS_PER_BATCH, len(pairs) - start))
             )
+            rivals = [self.rivals.get(tuple(pair)) for pair in out.pairs.tolist()]
+            return out.or_better(rivals)
 
         for batch in map_in_threads(run, starts, _THREADS):
             self.found.append(batch)
-            if self.on_pairs is not None:
-                self.on_pairs(batch.in_input_frames(self.scans))
+            self._tell(batch)
             done += len(batch.overlap)
             self.report("registering pairs", done, total)
+
+    def _tell(self, found: RelativeMotions) -> None:
+        if self.on_pairs is not None:
+            self.on_pairs(found.in_input_frames(self.scans))
+
+    def _follow(self) -> None:
+        """Neighbours of a sequence, by descents from the motions before.
+
+        What is sure is known from here on; the rest competes with the search.
+        """
+        scans, step = self.scans, np.eye(self.scans.mean.shape[1] + 1)
+        sure: dict[tuple[int, int], np.ndarray] = {}
+        found = [] if self.known is None else [self.known]
+        gaps = [(k, k + gap) for gap in (1, 2) for k in range(scans.num_scans - gap)]
+        for done, (i, j) in enumerate(gaps):
+            self.report("following the sequence", done, len(gaps))
+            guess = step if j == i + 1 else None
+            if guess is None and (i, i + 1) in sure and (i + 1, j) in sure:
+                guess = sure[i, i + 1] @ sure[i + 1, j]
+            if guess is None:
+                continue
+            one = descended_in_input_frames(self.method, scans, (i, j), guess)
+            if float(one.overlap[0]) < SURE:
+                self.rivals[i, j] = one
+                continue
+            # Known pairs are followed, too: a run taken up again goes the same way.
+            if (i, j) not in self.row:
+                self._tell(one)
+                self.row[i, j] = sum(len(x.overlap) for x in found)
+                found.append(one)
+            step = sure[i, j] = np.asarray(one.in_input_frames(scans).T_i_j[0])
+        self.report("following the sequence", len(gaps), len(gaps))
+        if found:
+            self.known = jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
     def _evidence(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Trusted pairs, likely overlap and parts, see `next_pairs`."""

@@ -168,6 +168,25 @@ def test_a_sequence_takes_fewer_pairs(sculpture):
     assert np.array(_errors(sol, truth))[:, 0].max() < 0.02
 
 
+def test_a_sequence_goes_on_as_it_moved_before(sculpture):
+    scans, truth = sculpture
+    # Frames that a scanner would have on an even turn about the sculpture.
+    step = motion(5, 3, angle=0.2, shift=0.02)
+    poses = np.stack([np.linalg.matrix_power(step, k) for k in range(len(scans))])
+    told = np.linalg.inv(poses) @ np.linalg.inv(truth[0]) @ truth
+    calls = []
+    sol = jr.reconstruct(
+        [move(T, points) for T, points in zip(told, scans, strict=True)],
+        key=jax.random.key(0),
+        method=FILTER,
+        order="sequential",
+        progress=lambda *call: calls.append(call),
+    )
+    assert np.array(_errors(sol, poses))[:, 0].max() < 0.02
+    # Found without a search: most of the seven steps.
+    assert next(done for stage, done, _ in calls if stage == "registering pairs") >= 4
+
+
 def test_bad_scans_are_reported_and_the_others_placed(sculpture):
     scans, truth = sculpture
     # In place of scan 0: a foreign object. Of scan 1: too few points, and NaN rows.
