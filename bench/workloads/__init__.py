@@ -100,6 +100,20 @@ WORKLOADS = {
         "Scans to poses, no guess. Errors are those of the MCC paper, e_R and e_t, "
         "with scan 0 as the common frame.",
     ),
+    "multiview_robust": Workload(
+        "Many scans of which some do not belong",
+        "As above with a foreign scan, a scan twice, two objects, or half of all "
+        "points uniform noise in the box of each scan. `right`: scans within 5 degrees "
+        "and 5 mm of their object's first, and foreign ones left out, at the worst "
+        "seed; `wrong`: scans placed elsewhere.",
+        quick=False,
+    ),
+    "multiview_size": Workload(
+        "Many scans: time against their number",
+        "The sculpture from ever more sides, no guess. `pairs` is how many "
+        "registrations were spent.",
+        quick=False,
+    ),
     "gradients": Workload(
         "Gradients",
         "Gradients of a sum over the answer beside the answer itself, float64, and how "

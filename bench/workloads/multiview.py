@@ -1,7 +1,8 @@
-"""Scans into one frame without a guess: the Bunny, the Dragon, a made sculpture."""
+"""Scans into one frame without a guess: two objects, a sculpture, a room."""
 
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ from bench.peers.multiview import Multiway
 from bench.records import Metric, error
 from jaxreg import reconstruct
 from jaxreg.datasets import sculpture_scans
+from jaxreg.io import read_log
 from jaxreg.metrics import rotation_error, translation_error
 
 
@@ -73,6 +75,22 @@ def _full(options: Options) -> Iterator[Scans]:
         if (options.data / folder / file).exists():
             title, scans, T_world_i = load_scans(name, options.data)
             yield Scans(title, scans, T_world_i, 0.0025, 0.3, True)
+    folder = options.data / "kitchen_fragments"
+    if folder.exists():
+        yield _kitchen(folder)
+
+
+def _kitchen(folder: Path) -> Scans:
+    """Fragments of a room; the truth of each is its motion to the first."""
+    with np.load(folder / "fragments.npz") as file:
+        scans = [file[name] for name in file.files]
+    truth = read_log(folder / "gt.log")
+    T_world_i = np.tile(np.eye(4), (len(scans), 1, 1))
+    edges, T_i_j = np.asarray(truth.edges), np.asarray(truth.T_i_j)
+    for (i, j), T in zip(edges, T_i_j, strict=True):
+        if i == 0:
+            T_world_i[j] = T
+    return Scans("kitchen, 6 fragments", scans, T_world_i, 0.05, 0.3, True)
 
 
 def _own(scans: list[np.ndarray], seed: int) -> np.ndarray:

@@ -1,0 +1,66 @@
+"""Time against the number of scans: the sculpture from 12 to 100 sides."""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from bench.case import Case, Judged, Method, Options
+from bench.peers.multiview import Multiway
+from bench.records import Metric
+from bench.workloads.multiview import judge as judge_poses
+from jaxreg import reconstruct
+from jaxreg.datasets import sculpture_scans
+
+
+# All pairs of more are minutes for the peer.
+_PEER_UP_TO = 24
+
+
+def cases(options: Options) -> Iterator[Case]:
+    """A case per number of scans."""
+    del options
+    peer = Multiway(0.005, 0.002, 0.5, camera_at_origin=False)
+    for num in (12, 24, 48, 100):
+        scans, T_world_i = sculpture_scans(num, seed=0)
+        methods = [Method("jaxreg reconstruct", "jaxreg", "defaults", _own)]
+        if num <= _PEER_UP_TO:
+            methods.append(
+                Method(
+                    "Open3D FPFH + RANSAC, multiway",
+                    "open3d",
+                    f"all pairs, {peer}",
+                    partial(_theirs, peer),
+                )
+            )
+        yield Case(
+            name=f"{num} scans",
+            data=f"sculpture, {num} views of 8,000 points",
+            methods=methods,
+            trials=[(scans, seed) for seed in range(5)],
+            judge=partial(judge, T_world_i),
+            x=float(num),
+            x_label="scans",
+        )
+
+
+def _own(scans: list[np.ndarray], seed: int) -> tuple[np.ndarray, int]:
+    found = reconstruct(scans, key=jax.random.key(seed))
+    placed = np.asarray(found.placed)[:, None, None]
+    T = np.where(placed, np.asarray(found.T_world_i), np.nan)
+    return T, len(np.asarray(found.overlap))
+
+
+def _theirs(
+    peer: Multiway, scans: list[np.ndarray], seed: int
+) -> tuple[np.ndarray, int]:
+    return peer.solve(scans, seed), len(scans) * (len(scans) - 1) // 2
+
+
+def judge(T_true: np.ndarray, answers: list[Any]) -> Judged:
+    """As for `multiview`, and the registrations that were spent."""
+    judged = judge_poses(T_true, [T for T, _ in answers])
+    spent = float(np.median([pairs for _, pairs in answers]))
+    return Judged([*judged.metrics, Metric("pairs", spent, "", "down")], judged.samples)
