@@ -5,7 +5,6 @@ finds most pairs of a sequence in a fraction of a search. What it finds is belie
 once only if it overlaps by so much as no chance does; else it competes with the search.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -13,17 +12,25 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.compile import compiled
-from jaxreg.local import LocalOptimiser, Problem
+from jaxreg.geometry import lie
+from jaxreg.local import (
+    GaussNewton,
+    LocalOptimiser,
+    PlaneToPlane,
+    Problem,
+    mutual_overlap,
+    score_both_ways,
+)
 from jaxreg.multiview.relative import RelativeMotions
 from jaxreg.multiview.scans import PreparedScans
-from jaxreg.particle import ParticleFilter, Particles
-from jaxreg.particle.conclude import Pair, conclude
+from jaxreg.particle import ParticleFilter
 
 
 #: Overlap from which no search competes with a motion.
 SURE = 0.5
-# Steps from the first kernel width of the search to the last one's scale.
-_STEPS = 12
+# Steps from the first kernel width of the search to the sample spacing, and there in
+# the metric of both surfaces.
+_STEPS, _POLISH = 24, 8
 
 
 @compiled
@@ -34,34 +41,26 @@ def descended(
     T_i_j: Float[Array, "e D D"],
 ) -> RelativeMotions:
     """Motions by descents from guesses, in the scans' centred frames."""
+    widest, dtype = method.width_start, T_i_j.dtype
+    coarse = LocalOptimiser(method.residual, method.kernel, method.step)
+    fine = LocalOptimiser(PlaneToPlane(0.01), method.kernel, GaussNewton())
+    coarse, fine = cast_floats((coarse, fine), dtype)
 
     def one(row: tuple[Array, Array]) -> RelativeMotions:
         (i, j), T = row
-        source, target = scans.cloud(j), scans.cloud(i)
-        pair = Pair(source, target, scans.table(j), scans.table(i))
-        optimiser = LocalOptimiser(method.residual, method.kernel, method.step)
-        optimiser = cast_floats(optimiser, T.dtype)
-        widths = jnp.geomspace(method.width_start, method.width_end, _STEPS)
-        problem = Problem.of(source, target, scans.table(i))
-        T = optimiser.repeat(problem, T, widths.astype(T.dtype))
-        particles = Particles.at(T[None], 1)
-        particles = eqx.tree_at(lambda p: p.energy, particles, jnp.zeros_like(T[0, :1]))
-        found = conclude(
-            pair,
-            particles,
-            jnp.asarray(_STEPS, jnp.int32),
-            jnp.asarray(True),
-            kernel=cast_floats(method.kernel, T.dtype),
-            num_modes=1,
-            refine_steps=method.refine_steps,
-            min_overlap=method.min_overlap,
-        )
-        usable = scans.enough[i] & scans.enough[j]
+        clouds = scans.cloud(j), scans.cloud(i), scans.table(j), scans.table(i)
+        problem = Problem.of(clouds[0], clouds[1], clouds[3])
+        spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
+        widths = jnp.geomspace(widest, 0.5 * spacing, _STEPS).astype(dtype)
+        T = lie.orthonormalise(coarse.repeat(problem, T, widths))
+        there, back = score_both_ways(*clouds, T[None], jnp.ones(1, bool), spacing)
+        T = fine.repeat(problem, T, jnp.full(_POLISH, 0.5 * spacing, dtype))
+        sound = scans.enough[i] & scans.enough[j] & jnp.all(jnp.isfinite(T))
         return RelativeMotions(
             row[0],
-            found.T_target_source,
-            jnp.where(usable, found.overlap, 0),
-            found.inlier_rmse,
+            jnp.where(sound, lie.orthonormalise(T), jnp.eye(len(T), dtype=dtype)),
+            jnp.where(sound, mutual_overlap(there, back)[0], 0),
+            there.inlier_rmse[0],
         )
 
     return lax.map(one, (pairs, T_i_j))

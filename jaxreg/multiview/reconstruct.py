@@ -57,7 +57,8 @@ def reconstruct(
             between its viewpoint and its points, and poses that put points of others
             there count as contradicted. Only for scans from one place each.
         order: "sequential" if each scan overlaps the next: only neighbours are
-            registered to begin with, of any number of scans; not under `jit`.
+            registered to begin with, of any number of scans, where the scanner moved on
+            as before without a search; not under `jit`.
         previous: a `ReconstructionSolution` of the first of these scans, whose pairs
             are not registered again; or the `RelativeMotions` that `on_pairs` got in a
             run that was interrupted, which leads to the same answer. Not under `jit`.

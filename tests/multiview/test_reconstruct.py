@@ -281,6 +281,7 @@ def test_wrong_scans_are_named(scans, words):
     [
         ({"order": "random"}, ValueError, "order: wanted 'any' or 'sequential'"),
         ({"previous": 3}, TypeError, "previous: wanted a Reconstr.*found int"),
+        ({"hold_previous": True}, ValueError, "hold_previous: wanted a Rec.*NoneType"),
         ({"previous": MOTIONS}, ValueError, "previous: of 9 scans, but there are 8"),
     ],
 )
