@@ -90,7 +90,6 @@ def _updated(before: Placement, after: Placement) -> Placement:
     return eqx.tree_at(lambda p: (p.T_world_i, p.part), before, (T, first))
 
 
-# Not `compiled`: the older generator takes minutes and 13 GB over the exact search.
 @eqx.filter_jit
 def measured(
     scans: PreparedScans, placement: Placement, min_overlap: Scalar, *, exact: bool

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.multiview.scans import PreparedScans
 from jaxreg.particle import ParticleFilter
@@ -69,7 +68,7 @@ class RelativeMotions(eqx.Module):
         return RelativeMotions(self.pairs, T_i_j, self.overlap, rmse)
 
 
-@compiled
+@eqx.filter_jit
 def relative_motions(
     method: ParticleFilter,
     scans: PreparedScans,

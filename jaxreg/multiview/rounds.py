@@ -8,7 +8,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.threads import map_in_threads
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
@@ -167,7 +166,7 @@ class Rounds:
         return trusted | trusted.T, likely + likely.T, np.asarray(placement.part)
 
 
-@compiled
+@eqx.filter_jit
 def _prospects(
     method: ParticleFilter,
     averaging: AbstractAverager | None,

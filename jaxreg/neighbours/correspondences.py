@@ -5,7 +5,6 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxreg._core.checks import as_float_array, check_motion, check_pair
-from jaxreg._core.compile import compiled
 from jaxreg.geometry import lie
 from jaxreg.neighbours.auto import exact_index
 from jaxreg.neighbours.base import Neighbours
@@ -59,7 +58,7 @@ def correspondences(
     return _find(source, target, T, max_distance, source_mask, target_mask)
 
 
-@compiled
+@eqx.filter_jit
 def _find(
     source: Array,
     target: Array,

@@ -13,7 +13,6 @@ from jaxtyping import Array
 from jaxreg._core.checks import (
     is_concrete,
 )
-from jaxreg._core.compile import compiled
 from jaxreg._core.padding import (
     rounded_up,
     stacked,
@@ -161,7 +160,7 @@ def _over_cores(
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
-@compiled
+@eqx.filter_jit
 def _register_rows(
     method: AbstractRegistrar, pairs: _Pairs, impl: Hashable
 ) -> RegistrationSolution:

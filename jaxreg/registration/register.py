@@ -9,7 +9,6 @@ from jaxreg._core.checks import (
     check_motion,
     check_pair,
 )
-from jaxreg._core.compile import compiled
 from jaxreg._core.padding import (
     check_lists,
     is_list_of_clouds,
@@ -115,7 +114,7 @@ def _check_init(
         ) from err
 
 
-@compiled
+@eqx.filter_jit
 def _register_one(
     method: AbstractRegistrar,
     pair: tuple[Array, ...],
