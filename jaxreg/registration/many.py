@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Hashable
 from typing import TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,5 +1,6 @@
 """`register`: what its users call."""
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
