@@ -1,8 +1,8 @@
 """`compiled`: jit for programs of many small kernels, quicker to compile on CPU.
 
 XLA's newer generator of CPU kernels takes longer over each kernel than the older one:
-with that a first call of `average` takes two thirds of the time, and later ones at most
-a fifth more. Not for the search of closest points: over long chains of comparisons the
+with that a first call of `average` takes two thirds of the time, and later ones a
+quarter more. Not for the search of closest points: over long chains of comparisons the
 older generator takes minutes.
 """
 
