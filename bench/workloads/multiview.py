@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bench.case import Case, Judged, Method, Options
+from bench.case import Case, Judged, Method, Options, Solve
 from bench.motion_scans import SETS, load_scans
 from bench.peers.multiview import Multiway
 from bench.records import Metric, error
@@ -17,6 +17,10 @@ from jaxreg import reconstruct
 from jaxreg.datasets import sculpture_scans
 from jaxreg.io import read_log
 from jaxreg.metrics import rotation_error, translation_error
+
+
+#: The name of Open3D's pipeline.
+PEER = "Open3D FPFH + RANSAC, multiway"
 
 
 class Scans(NamedTuple):
@@ -48,19 +52,21 @@ def cases(options: Options) -> Iterator[Case]:
         yield Case(
             name=data.name,
             data=f"{len(data.scans)} scans of {len(data.scans[0])} points",
-            methods=[
-                Method("jaxreg reconstruct", "jaxreg", "defaults", _own),
-                Method(
-                    "Open3D FPFH + RANSAC, multiway",
-                    "open3d",
-                    f"all pairs, {method}",
-                    method.solve,
-                ),
-            ],
+            methods=[own_method(_own), peer_method(method, method.solve)],
             trials=[(data.scans, seed) for seed in range(5)],
             judge=partial(judge, data.T_world_i),
-            reference="Open3D FPFH + RANSAC, multiway",
+            reference=PEER,
         )
+
+
+def own_method(solve: Solve) -> Method:
+    """`reconstruct` as it is."""
+    return Method("jaxreg reconstruct", "jaxreg", "defaults", solve)
+
+
+def peer_method(peer: Multiway, solve: Solve) -> Method:
+    """Open3D's pipeline."""
+    return Method(PEER, "open3d", f"all pairs, {peer}", solve)
 
 
 def _quick() -> Iterator[Scans]:

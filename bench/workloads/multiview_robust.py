@@ -5,13 +5,17 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from bench.case import Case, Judged, Method, Options
+from bench.case import Case, Judged, Options
 from bench.motion_scans import SETS, load_scans
 from bench.peers.multiview import Multiway
 from bench.records import Metric, error
+from bench.workloads.multiview import PEER, own_method, peer_method
 from jaxreg import reconstruct
+from jaxreg.metrics import rotation_errors, translation_errors
+from tests.helpers import half_noise
 
 
 # A scan is right within these of its object's first scan.
@@ -59,19 +63,11 @@ def cases(options: Options) -> Iterator[Case]:
         yield Case(
             name=mixture.name,
             data=f"{len(mixture.scans)} scans",
-            methods=[
-                Method("jaxreg reconstruct", "jaxreg", "defaults", _own),
-                Method(
-                    "Open3D FPFH + RANSAC, multiway",
-                    "open3d",
-                    f"all pairs, {peer}",
-                    partial(_theirs, peer),
-                ),
-            ],
+            methods=[own_method(_own), peer_method(peer, partial(_theirs, peer))],
             trials=[(mixture.scans, seed) for seed in range(3)],
             repeats=2,
             judge=partial(judge, mixture),
-            reference="Open3D FPFH + RANSAC, multiway",
+            reference=PEER,
         )
 
 
@@ -100,18 +96,10 @@ def _mixtures(options: Options) -> Iterator[Mixture]:
         np.append(zeros, np.ones(7, int)),
         np.concatenate([T_b, T_d[:7]]),
     )
-    rng = np.random.default_rng(0)
-    half = [half_noise(scan, rng) for scan in b]
+    half = [half_noise(scan, seed) for seed, scan in enumerate(b)]
     yield Mixture("Bunny, half of the points noise", half, zeros, T_b)
-    half = [half_noise(scan, rng) for scan in d]
+    half = [half_noise(scan, seed) for seed, scan in enumerate(d)]
     yield Mixture("Dragon, half of the points noise", half, np.zeros(len(d), int), T_d)
-
-
-def half_noise(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Half of the points replaced by uniform ones in the scan's bounding box."""
-    out, rows = scan.copy(), rng.permutation(len(scan))[: len(scan) // 2]
-    out[rows] = rng.uniform(scan.min(axis=0), scan.max(axis=0), (len(rows), 3))
-    return out
 
 
 def _own(scans: list[np.ndarray], seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +137,6 @@ def judge(mixture: Mixture, answers: list[Any]) -> Judged:
 
 def _errors(T: np.ndarray, T_true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Radians and millimetres, the first scan being the common frame."""
-    found, true = (np.linalg.inv(x[0].astype(float)) @ x for x in (T, T_true))
-    chord = np.linalg.norm((found - true)[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
-    shift = np.linalg.norm((found - true)[:, :3, 3], axis=1)
-    return 2 * np.arcsin(np.minimum(chord, 1)), 1e3 * shift
+    found, true = jnp.asarray(T, jnp.float32), jnp.asarray(T_true, jnp.float32)
+    shift = np.asarray(translation_errors(found, true))
+    return np.asarray(rotation_errors(found, true)), 1e3 * shift

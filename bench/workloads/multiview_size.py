@@ -7,10 +7,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from bench.case import Case, Judged, Method, Options
+from bench.case import Case, Judged, Options
 from bench.peers.multiview import Multiway
 from bench.records import Metric
 from bench.workloads.multiview import judge as judge_poses
+from bench.workloads.multiview import own_method, peer_method
 from jaxreg import reconstruct
 from jaxreg.datasets import sculpture_scans
 
@@ -25,16 +26,9 @@ def cases(options: Options) -> Iterator[Case]:
     peer = Multiway(0.005, 0.002, 0.5, camera_at_origin=False)
     for num in (12, 24, 48, 100):
         scans, T_world_i = sculpture_scans(num, seed=0)
-        methods = [Method("jaxreg reconstruct", "jaxreg", "defaults", _own)]
+        methods = [own_method(_own)]
         if num <= _PEER_UP_TO:
-            methods.append(
-                Method(
-                    "Open3D FPFH + RANSAC, multiway",
-                    "open3d",
-                    f"all pairs, {peer}",
-                    partial(_theirs, peer),
-                )
-            )
+            methods.append(peer_method(peer, partial(_theirs, peer)))
         yield Case(
             name=f"{num} scans",
             data=f"sculpture, {num} views of 8,000 points",
