@@ -1,7 +1,7 @@
 """`jaxreg average`: poses from the relative motions of a g2o file."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,11 +20,12 @@ from jaxreg.averaging import (
     average,
 )
 from jaxreg.cli import outputs
-from jaxreg.cli.runtime import Options, Session
+from jaxreg.cli.runtime import Options, Precision, Session
 from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.io.atomic import atomic_folder, require_writable
+from jaxreg.io.atomic import require_writable
+from jaxreg.io.errors import InputError
 from jaxreg.io.g2o import read_g2o, read_g2o_poses, write_g2o
-from jaxreg.io.result import versions, write_json
+from jaxreg.io.result import result_folder, versions, write_json
 from jaxreg.io.tum import write_tum
 from jaxreg.metrics import chordal_objective
 from jaxreg.plot import graph_figure, write_graph_report
@@ -46,14 +47,22 @@ class Average(Options):
     """A g2o file; its vertices are not used, the answer comes from its edges alone."""
     method: Literal["correntropy", "plain", "weighted"] = "correntropy"
     """Correntropy bears wrong edges; plain and weighted are for graphs without any."""
+    precision: Precision = field(default="float64", kw_only=True)
+    """Of the computation; graphs of thousands of poses need the digits."""
+    budget: Annotated[
+        int | None,
+        tyro.conf.arg(
+            metavar="INT", help_behavior_hint="(default: 100; plain, weighted: 50)"
+        ),
+    ] = None
+    """Steps of the method, at most."""
 
     def run(self, session: Session) -> int:
         """Runs the command; returns the exit code."""
-        # Graphs of thousands of poses need the digits; the setting ends with the block.
-        with jax.enable_x64(True):
-            return self._run(session)
-
-    def _run(self, session: Session) -> int:
+        if self.budget is not None and self.budget < 1:
+            raise InputError(f"--budget {self.budget}: wanted at least 1 step.")
+        steps = {} if self.budget is None else {"max_steps": self.budget}
+        method = METHODS[self.method](**steps)
         with session.timed("read"), warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             graph = read_g2o(self.graph)
@@ -66,7 +75,7 @@ class Average(Options):
             progress("averaging", 0, 2)
             before = average(graph, method=SpanningTree(by="path"))
             progress("averaging", 1, 2)
-            sol = average(graph, method=METHODS[self.method](), key=key)
+            sol = average(graph, method=method, key=key)
             jax.block_until_ready(sol)
             progress("averaging", 2, 2)
         objective = [
@@ -86,7 +95,7 @@ class Average(Options):
         ids: np.ndarray,
         objective: list[float],
     ) -> None:
-        with atomic_folder(self.out) as staging:
+        with result_folder(self.out) as staging:
             with session.timed("write"):
                 graph_figure(
                     staging / "figure.png",
@@ -112,6 +121,7 @@ class Average(Options):
                 "seed": session.options.seed,
                 "times_s": {k: round(v, 3) for k, v in session.times.items()},
                 "versions": versions(),
+                "files": list(FILES),
             }
             write_json(staging / "result.json", document)
             with outputs.page_or_message(session):

@@ -5,19 +5,19 @@ from dataclasses import dataclass
 from jaxreg.cli import outputs
 from jaxreg.cli.inputs import Scans
 from jaxreg.cli.multiview import reconstruct_scans, report, require_two_placed
-from jaxreg.cli.runtime import Options, Session
+from jaxreg.cli.runtime import SearchOptions, Session
 from jaxreg.datasets.sculpture import sculpture_scans
 from jaxreg.io.atomic import require_writable
 
 
 @dataclass(frozen=True)
-class Demo(Options):
+class Demo(SearchOptions):
     """Scan a sculpture from twelve views, reconstruct it, compare to the truth."""
 
     def run(self, session: Session) -> int:
         """Runs the command; returns the exit code."""
         require_writable(self.out)
-        key = self.key()
+        key, method = self.key(), self.method()
         session.console.print(
             "Twelve noisy scans of a sculpture 0.2 m tall, each in a frame of its own, "
             "no initial guess."
@@ -27,7 +27,7 @@ class Demo(Options):
         names = [f"view{k:02d}" for k in range(len(points))]
         scans = Scans(names, points, names)
         with session.progress() as progress, session.timed("run", computes=True):
-            result = reconstruct_scans(scans, key, progress)
+            result = reconstruct_scans(scans, key, method, progress)
         require_two_placed(result, scans)
         errors = outputs.pose_errors(result, names, T_world_i)
         report(session, result, scans, errors)

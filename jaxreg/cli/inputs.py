@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxreg.io.errors import InputError
@@ -31,15 +32,17 @@ class Scans:
     def centred(self) -> tuple[list[np.ndarray], np.ndarray]:
         """Scans moved to their own middles, and these, `(v, d)` float64.
 
-        Map coordinates of seven digits before the point are thereby cut to float32
-        without loss: the subtraction is in float64.
+        The former in the precision that JAX computes in. Map coordinates of seven
+        digits before the point are thereby cut to float32 without loss: the
+        subtraction is in float64.
         """
+        dtype = jnp.result_type(float)
         middles = [
             np.median(x[np.isfinite(x).all(axis=1)].astype(np.float64), axis=0)
             for x in self.points
         ]
         moved = [
-            (x.astype(np.float64) - c).astype(np.float32)
+            (x.astype(np.float64) - c).astype(dtype)
             for x, c in zip(self.points, middles, strict=True)
         ]
         return moved, np.stack(middles)

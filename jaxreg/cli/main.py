@@ -75,9 +75,9 @@ def _run(arguments: list[str]) -> int:
     if isinstance(command, commands.Info):
         return command.run()
     line = os.fsencode(shlex.join(["jaxreg", *arguments]))
-    code = command.run(
-        runtime.Session(command, line.decode("utf-8", "backslashreplace"))
-    )
+    session = runtime.Session(command, line.decode("utf-8", "backslashreplace"))
+    with command.computing():
+        code = command.run(session)
     if command.json:
         sys.stdout.write((command.out / "result.json").read_text(encoding="utf-8"))
     return code

@@ -5,48 +5,46 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
+import jaxreg
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Progress
 from jaxreg.cli import outputs
 from jaxreg.cli.inputs import Scans, load_scans
-from jaxreg.cli.runtime import Options, Session
+from jaxreg.cli.runtime import SearchOptions, Session
 from jaxreg.io.atomic import require_writable
 from jaxreg.io.errors import InputError
 from jaxreg.io.pair_log import PairLog, Pairs
-from jaxreg.io.result import Result, file_of, version
+from jaxreg.io.result import Result, version
 from jaxreg.io.stanford import read_conf
 
 
 Order = Literal["any", "sequential"]
 
-FILES = (
-    "result.json",
-    "poses.tum",
-    "graph.g2o",
-    "merged.ply",
-    "figure.png",
-    "report.html",
-)
-
 
 @dataclass(frozen=True)
-class Multiview(Options):
+class Multiview(SearchOptions):
     """Bring scans into one frame, without an initial guess."""
 
     scans: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN ...")
     ]
     """Files (PLY, XYZ, PCD, LAS, ...), a folder of these, or an archive (NPZ, E57)."""
-    truth: Path | None = None
-    """Pose file of the Stanford repository (.conf, metres): adds a table of errors."""
+    truth: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE.conf", help_behavior_hint="(default: none)"),
+    ] = None
+    """Poses as the Stanford repository has them, metres: adds a table of errors."""
     order: Order = "any"
     """Of the scans; sequential if each overlaps the next: fewer pairs are tried."""
-    viewpoint: tuple[float, ...] | None = None
-    """Where the scanner stood in the frame of every scan, such as 0 0 0: poses that put
-    points into what it saw to be free are told from right ones."""
+    viewpoint: Annotated[
+        tuple[float, ...] | None,
+        tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
+    ] = None
+    """Where the scanner stood in the frame of every scan, in its unit: often 0 0 0."""
     resume: bool = False
     """Go on with the pairs that an interrupted run left in the output folder."""
 
@@ -61,11 +59,11 @@ class Multiview(Options):
             _check_viewpoint(self.viewpoint, scans)
             truth = None if self.truth is None else _read_truth(self.truth, scans)
         require_writable(self.out)
-        key, log = self.key(), self._log(scans)
+        key, method, log = self.key(), self.method(), self._log(session, scans)
         try:
             with session.progress() as progress, session.timed("run", computes=True):
                 result = reconstruct_scans(
-                    scans, key, progress, self.order, log, self.viewpoint
+                    scans, key, method, progress, self.order, log, self.viewpoint
                 )
         except KeyboardInterrupt as err:
             if not len(log):
@@ -80,7 +78,7 @@ class Multiview(Options):
         log.remove()
         return 0
 
-    def _log(self, scans: Scans) -> PairLog:
+    def _log(self, session: Session, scans: Scans) -> PairLog:
         digest = hashlib.sha256(repr(scans.names).encode())
         for points in scans.points:
             digest.update(np.ascontiguousarray(points).tobytes())
@@ -88,14 +86,23 @@ class Multiview(Options):
             "scans": digest.hexdigest(),
             "seed": self.seed,
             "viewpoint": self.viewpoint,
+            "budget": self.budget,
+            "precision": self.precision,
             "version": version("jaxreg"),
         }
-        return PairLog(self.out / "pairs.jsonl", run, resume=self.resume)
+        log = PairLog(self.out / "pairs.jsonl", run, resume=self.resume)
+        if not self.resume and log.path.exists():
+            session.console.print(
+                f"{log.path}: pairs of an interrupted run, replaced by those of this "
+                "one; --resume would go on with them."
+            )
+        return log
 
 
 def reconstruct_scans(
     scans: Scans,
     key: Any,
+    method: jaxreg.ParticleFilter,
     progress: Progress,
     order: Order = "any",
     log: PairLog | None = None,
@@ -105,14 +112,13 @@ def reconstruct_scans(
 
     Pairs that `log` holds are not registered again, and those found are added to it.
     """
-    import jaxreg
-
     centred, middles = scans.centred()
-    eyes = None if viewpoint is None else (viewpoint - middles).astype(np.float32)
+    eyes = None if viewpoint is None else (viewpoint - middles).astype(centred[0].dtype)
     kept = None if log is None or log.pairs is None else log.pairs
     sol = jaxreg.reconstruct(
         centred,
         key=key,
+        method=method,
         order=order,
         viewpoints=eyes,
         previous=None if kept is None else jaxreg.RelativeMotions(*map(_array, kept)),
@@ -159,9 +165,7 @@ def _check_viewpoint(viewpoint: tuple[float, ...] | None, scans: Scans) -> None:
 
 def _array(x: np.ndarray) -> Any:
     """On the device, floats as the centred scans have them."""
-    import jax.numpy as jnp
-
-    return jnp.asarray(x, jnp.float32 if x.dtype.kind == "f" else x.dtype)
+    return jnp.asarray(x, jnp.result_type(float) if x.dtype.kind == "f" else x.dtype)
 
 
 def _pairs(motions: Any) -> Pairs:
@@ -201,13 +205,7 @@ def report(
     outputs.show_scans(session, result)
     if errors is not None:
         outputs.show_errors(session, errors)
-    per_component = ("poses.tum", "graph.g2o", "merged.ply")
-    more = [
-        file_of(name, k)
-        for k in range(1, result.num_components)
-        for name in per_component
-    ]
-    outputs.show_end(session, [*FILES, *more], session.options.out)
+    outputs.show_end(session, result.files, session.options.out)
 
 
 def _read_truth(path: Path, scans: Scans) -> tuple[list[str], np.ndarray]:

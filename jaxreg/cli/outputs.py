@@ -12,9 +12,8 @@ from rich.table import Table
 
 from jaxreg._core.status import Status
 from jaxreg.cli.runtime import Session
-from jaxreg.io.atomic import atomic_folder
 from jaxreg.io.errors import MissingExtraError
-from jaxreg.io.result import Result, result_document, write_result
+from jaxreg.io.result import Result, result_document, result_folder, write_result
 from jaxreg.metrics import rotation_errors, translation_errors
 from jaxreg.plot import reconstruction_figure, write_report
 
@@ -65,14 +64,14 @@ def write_files(
         modes: other poses of the second of two scans, for the page.
         covariances: `(v, k, k)` of the poses, for the page.
     """
-    with atomic_folder(session.options.out) as staging:
+    with result_folder(session.options.out) as staging:
         with session.timed("write"):
             reconstruction_figure(
                 staging / "figure.png",
                 scans,
                 result.T_world_i,
                 result.names,
-                result.placed,
+                result.component,
             )
         document = result_document(
             result,
@@ -119,8 +118,8 @@ def _setting(value: Any) -> str:
 
 def pose_errors(
     result: Result, names: Sequence[str], T_true_i: np.ndarray
-) -> dict[str, Any]:
-    """Errors against true poses, the first placed scan being brought to its truth.
+) -> dict[str, Any] | None:
+    """Errors against true poses, the first scan of a component being brought to its.
 
     Args:
         result: poses.
@@ -128,26 +127,32 @@ def pose_errors(
         T_true_i: `(len(names), d+1, d+1)` true poses.
 
     Returns:
-        `names`, `e_R` (radians) and `e_t` (unit of the scans) of each placed scan with
-        known truth, and their means `mean_e_R`, `mean_e_t` as in the MCC paper.
+        Of the scans that have a pose and a known truth, by component: `names`,
+        `component`, `e_R` (radians) and `e_t` (unit of the scans); their means
+        `mean_e_R`, `mean_e_t` as in the MCC paper. None if there is no such scan.
     """
     row = {name: k for k, name in enumerate(names)}
-    known = [
-        i for i, name in enumerate(result.names) if result.placed[i] and name in row
-    ]
-    truth = T_true_i[[row[result.names[i]] for i in known]]
-    # Relative to the first of them, so that float32 meets no large common offset.
-    estimate = _relative(result.T_world_i[known])
-    T_est, T_true = jnp.asarray(estimate, float), jnp.asarray(_relative(truth), float)
-    e_R = np.asarray(rotation_errors(T_est, T_true), dtype=np.float64)
-    e_t = np.asarray(translation_errors(T_est, T_true), dtype=np.float64)
-    return {
-        "names": [result.names[i] for i in known],
-        "e_R": e_R.tolist(),
-        "e_t": e_t.tolist(),
-        "mean_e_R": float(e_R.mean()),
-        "mean_e_t": float(e_t.mean()),
-    }
+    found: dict[str, list[Any]] = {k: [] for k in ("names", "component", "e_R", "e_t")}
+    for component in range(result.num_components):
+        known = [
+            i
+            for i, name in enumerate(result.names)
+            if result.component[i] == component and name in row
+        ]
+        if not known:
+            continue
+        truth = T_true_i[[row[result.names[i]] for i in known]]
+        # Relative to the first of them, so that float32 meets no large common offset.
+        T_est = jnp.asarray(_relative(result.T_world_i[known]), float)
+        T_true = jnp.asarray(_relative(truth), float)
+        found["names"] += [result.names[i] for i in known]
+        found["component"] += [component] * len(known)
+        found["e_R"] += rotation_errors(T_est, T_true).tolist()
+        found["e_t"] += translation_errors(T_est, T_true).tolist()
+    if not found["names"]:
+        return None
+    means = {f"mean_{k}": float(np.mean(found[k])) for k in ("e_R", "e_t")}
+    return {**found, **means}
 
 
 def show_scans(session: Session, result: Result) -> None:
@@ -195,9 +200,10 @@ def show_errors(session: Session, errors: dict[str, Any]) -> None:
     table.add_column("scan")
     table.add_column("e_R [rad]", justify="right")
     table.add_column("e_t [mm]", justify="right")
-    rows = zip(errors["names"], errors["e_R"], errors["e_t"], strict=True)
-    for name, e_R, e_t in rows:
-        table.add_row(name, f"{e_R:.5f}", f"{1e3 * e_t:.3f}")
+    keys = ("names", "component", "e_R", "e_t")
+    for name, k, e_R, e_t in zip(*(errors[key] for key in keys), strict=True):
+        where = f"{name}{_whereabouts(k)}"
+        table.add_row(where, f"{e_R:.5f}", f"{1e3 * e_t:.3f}")
     table.add_section()
     table.add_row(
         "mean", f"{errors['mean_e_R']:.5f}", f"{1e3 * errors['mean_e_t']:.3f}"

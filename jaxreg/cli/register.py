@@ -8,18 +8,18 @@ import jax
 import numpy as np
 import tyro
 
+import jaxreg
 from jaxreg._core.status import Status
 from jaxreg.cli import outputs
 from jaxreg.cli.inputs import Scans, load_scans
-from jaxreg.cli.multiview import FILES
-from jaxreg.cli.runtime import Options, Session
+from jaxreg.cli.runtime import SearchOptions, Session
 from jaxreg.io.atomic import require_writable
 from jaxreg.io.errors import InputError
 from jaxreg.io.result import Result
 
 
 @dataclass(frozen=True)
-class Register(Options):
+class Register(SearchOptions):
     """Move one scan onto another, without an initial guess."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
@@ -37,10 +37,10 @@ class Register(Options):
                 "Name one of each (FILE.npz:KEY), or use: jaxreg multiview"
             )
         require_writable(self.out)
-        key = self.key()
+        key, method = self.key(), self.method()
         with session.progress() as progress, session.timed("run", computes=True):
             progress("registering", 0, 1)
-            result, modes, covariances = _register(scans, key)
+            result, modes, covariances = _register(scans, key, method)
             progress("registering", 1, 1)
         if not result.placed[1]:
             raise InputError(
@@ -55,14 +55,12 @@ class Register(Options):
 
 
 def _register(
-    scans: Scans, key: jax.Array
+    scans: Scans, key: jax.Array, method: jaxreg.ParticleFilter
 ) -> tuple[Result, tuple[np.ndarray, ...], np.ndarray]:
     """The result, the modes of the posterior, and the covariances of both poses."""
-    import jaxreg
-
     centred, middles = scans.centred()
     target, source = (x[np.isfinite(x).all(axis=1)] for x in centred)
-    sol = jaxreg.register(source, target, key=key)
+    sol = jaxreg.register(source, target, method, key=key)
     status = Status(int(sol.status))
     found = status in (Status.CONVERGED, Status.MAX_STEPS, Status.AMBIGUOUS)
     T_target_source = outputs.uncentre(
@@ -105,4 +103,4 @@ def _show(session: Session, result: Result) -> None:
     session.console.print(f"T_{target}_{source} =")
     for row in result.T_world_i[1]:
         session.console.print("  " + " ".join(f"{x:14.9g}" for x in row))
-    outputs.show_end(session, FILES, session.options.out)
+    outputs.show_end(session, result.files, session.options.out)

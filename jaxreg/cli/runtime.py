@@ -6,8 +6,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import jax
+import tyro
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -19,28 +21,68 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+import jaxreg
 from jaxreg._core.typing import Progress as ProgressCall
 from jaxreg.io.errors import InputError
+
+
+_FILTER = jaxreg.ParticleFilter()
+Precision = Literal["float32", "float64"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """Options of every command."""
 
-    out: Path = Path("jaxreg-out")
-    """Folder for the results; made if needed."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("jaxreg-out")
+    """For the results; made if needed."""
     seed: int = 0
-    """Of the random numbers; the same seed gives the same result."""
+    """Of the random numbers, 0 to 2^31 - 1; the same one gives the same result."""
+    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
+    """To compute on; auto takes an accelerator if JAX finds one."""
+    precision: Precision = "float32"
+    """Of the computation; float64 has more digits and takes longer."""
     quiet: bool = False
     """Print nothing but errors."""
     json: bool = False
     """Print the content of result.json to standard output, and nothing else there."""
+
+    @contextlib.contextmanager
+    def computing(self) -> Iterator[None]:
+        """On the device and in the precision that are asked for.
+
+        Raises:
+            InputError: if there is no such device.
+        """
+        if self.device != "auto":
+            _use_device(self.device)
+        # The precision ends with the block; the device is the process's.
+        with jax.enable_x64(self.precision == "float64"):
+            yield
 
     def key(self) -> jax.Array:
         """The key that the seed stands for."""
         if not 0 <= self.seed < 2**31:
             raise InputError(f"--seed {self.seed}: wanted a number from 0 to 2^31 - 1.")
         return jax.random.key(self.seed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions(Options):
+    """Options of the commands that search for poses of scans."""
+
+    budget: int = _FILTER.num_prior
+    """Poses drawn at most for a pair of scans; more find harder pairs and take time."""
+
+    def method(self) -> jaxreg.ParticleFilter:
+        """The search of that size."""
+        least = 2 * _FILTER.num_modes
+        if not least <= self.budget <= 2**20:
+            raise InputError(
+                f"--budget {self.budget}: wanted a number from {least} to 2^20."
+            )
+        carried = min(_FILTER.num_particles, self.budget)
+        return jaxreg.ParticleFilter(num_prior=self.budget, num_particles=carried)
 
 
 class Session:
@@ -87,6 +129,21 @@ class Session:
                 display.update(tasks[stage], completed=done, total=total)
 
             yield call
+
+
+def _use_device(kind: str) -> None:
+    before = jax.config.read("jax_platforms")
+    platforms = {"gpu": ("cuda", "rocm")}.get(kind, (kind,))
+    for platform in platforms:
+        jax.config.update("jax_platforms", platform)
+        with contextlib.suppress(RuntimeError):
+            if jax.default_backend() == kind:
+                return
+    jax.config.update("jax_platforms", before)
+    raise InputError(
+        f"--device {kind}: JAX finds none here.\n"
+        "Install JAX for it, or leave the option out."
+    )
 
 
 def keep_compiled_programs() -> None:

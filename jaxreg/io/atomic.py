@@ -3,7 +3,7 @@
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -57,13 +57,14 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
 
 
 @contextlib.contextmanager
-def atomic_folder(folder: str | Path) -> Iterator[Path]:
+def atomic_folder(folder: str | Path, replaces: Collection[str] = ()) -> Iterator[Path]:
     """Yields a staging folder whose files move into `folder` when the block succeeds.
 
     If the block raises, none of them appears: `folder` never holds half a result.
 
     Args:
         folder: made if needed, parents included; files of other names in it stay.
+        replaces: names of files in it that go, too, when the block succeeds.
 
     Raises:
         InputError: if the folder cannot be written.
@@ -75,6 +76,8 @@ def atomic_folder(folder: str | Path) -> Iterator[Path]:
     try:
         with tempfile.TemporaryDirectory(prefix=".jaxreg-", dir=folder) as staging:
             yield Path(staging)
+            for name in replaces:
+                (folder / name).unlink(missing_ok=True)
             for file in sorted(Path(staging).iterdir()):
                 os.replace(file, folder / file.name)
     except BaseException:

@@ -101,7 +101,8 @@ class PairLog:
         head, *lines = self.path.read_text(encoding="utf-8").split("\n")
         if head != self._head:
             raise InputError(
-                f"{self.path}: holds pairs of other scans, another seed or version.\n"
+                f"{self.path}: holds pairs of other scans, another seed, budget or "
+                "version.\n"
                 "Remove it, choose another --out, or leave out --resume to start anew."
             )
         return lines[:-1]  # behind the last line end: nothing, or a line cut off

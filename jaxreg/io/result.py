@@ -4,11 +4,12 @@ A `Result` is what a reconstruction or registration found, on the host and in fl
 in the frames and unit of the files that were read.
 """
 
+import contextlib
 import json
 import math
 import platform
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 
 from jaxreg._core.status import Status
 from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.io.atomic import atomic_write
+from jaxreg.io.atomic import atomic_folder, atomic_write
 from jaxreg.io.colors import scan_colors
 from jaxreg.io.g2o import write_g2o
 from jaxreg.io.ply import write_ply
@@ -29,6 +30,7 @@ from jaxreg.io.tum import write_tum
 
 _ROW = re.compile(r"\[[-+.,\d\seE]*\]")
 MAX_MERGED_POINTS = 2_000_000
+_PER_COMPONENT = ("poses.tum", "graph.g2o", "merged.ply")
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,16 @@ class Result:
         """At least one."""
         return int(self.component.max(initial=0)) + 1
 
+    @property
+    def files(self) -> list[str]:
+        """Names of the files of the result, the picture and the page included."""
+        more = [
+            file_of(name, k)
+            for k in range(1, self.num_components)
+            for name in _PER_COMPONENT
+        ]
+        return ["result.json", *_PER_COMPONENT, "figure.png", "report.html", *more]
+
     def best_pair(self, scan: int) -> int | None:
         """The row of the pair of this scan that overlaps most, None without pairs."""
         rows = np.flatnonzero((self.edges == scan).any(axis=1))
@@ -116,8 +128,32 @@ def result_document(
         "pairs": [_pair_entry(result, e) for e in range(len(result.edges))],
         "times_s": times,
         "versions": versions(),
+        "files": result.files,
     }
     return document if errors is None else {**document, "errors": errors}
+
+
+@contextlib.contextmanager
+def result_folder(folder: str | Path) -> Iterator[Path]:
+    """`atomic_folder`, without what an earlier result there has and this one lacks.
+
+    A folder then never mixes two results: `merged_2.ply` goes if the new result has one
+    component. Only files that the earlier result.json names are removed.
+
+    Raises:
+        InputError: if the folder cannot be written.
+    """
+    with atomic_folder(folder, replaces=_files_of_earlier(Path(folder))) as staging:
+        yield staging
+
+
+def _files_of_earlier(folder: Path) -> set[str]:
+    try:
+        document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        names = document.get("files", [])
+        return {n for n in names if n == Path(n).name and n not in ("", ".", "..")}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return set()  # none there, or another program's
 
 
 def write_json(path: str | Path, document: dict[str, Any]) -> None:

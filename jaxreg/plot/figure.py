@@ -15,6 +15,7 @@ from jaxreg.plot.render import render_points
 
 
 _MAX_POINTS = 600_000
+_MAX_MODELS = 4
 
 
 def reconstruction_figure(
@@ -22,27 +23,30 @@ def reconstruction_figure(
     scans: Sequence[np.ndarray],
     T_world_i: np.ndarray,
     names: Sequence[str],
-    placed: Sequence[bool] | np.ndarray | None = None,
+    component: Sequence[int] | np.ndarray | None = None,
 ) -> None:
     """Draws a PNG: the scans as given, the scans in one frame, and a cross-section.
 
     Each scan has one colour. The cross-section is a thin slab through the middle of the
     model, as in Fig. 1 of the MCC paper: where scans agree, their outlines coincide.
-    2D scans have no cross-section.
+    2D scans have no cross-section. Components beside the model have rows of their own,
+    up to four rows.
 
     Args:
         path: the PNG file; it appears whole or not at all.
         scans: `(n_i, d)` arrays; rows with NaN or inf are left out.
         T_world_i: `(v, d+1, d+1)` poses.
         names: of the scans, for the legend.
-        placed: which scans have a pose; the others are left out after "before".
+        component: `(v,)` number of each scan's component, -1 for scans without a pose,
+            which are left out after "before"; None if all are of one.
 
     Raises:
         InputError: if the file cannot be written.
         MissingExtraError: if matplotlib is not installed.
     """
     module = figure_module()
-    keep = np.ones(len(scans), bool) if placed is None else np.asarray(placed, bool)
+    component = np.zeros(len(scans), int) if component is None else component
+    component = np.asarray(component)
     stride = 1 + sum(len(s) for s in scans) // _MAX_POINTS
     before = [s[np.isfinite(s).all(axis=1)][::stride].astype(float) for s in scans]
     after = [
@@ -51,17 +55,27 @@ def reconstruction_figure(
     ]
     colors = scan_colors(len(scans))
     solid = before[0].shape[1] == 3
-    figure = module.Figure(figsize=(13, 4.9) if solid else (10, 4.9), dpi=130)
-    axes = figure.subplots(1, 3 if solid else 2)
-    if solid:
-        _draw_solid(axes, before, after, keep, colors)
-    else:
-        _draw_flat(axes, before, after, keep, colors)
-    for axis in axes:
+    rows = min(int(component.max()) + 1, _MAX_MODELS)
+    height = 3.9 * rows + 1
+    figure = module.Figure(figsize=(13 if solid else 10, height), dpi=130)
+    axes = figure.subplots(rows, 3 if solid else 2, squeeze=False)
+    draw = _draw_solid if solid else _draw_flat
+    for k, panels in enumerate(axes):
+        draw(panels, before, after, component == k, colors, first=k == 0)
+        if k:
+            panels[1].set_title(f"after: component {k}, in a frame of its own")
+    for axis in axes.flat:
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_axis_off()
-    _legend(figure, names, keep, colors)
-    figure.subplots_adjust(left=0.01, right=0.99, top=0.91, bottom=0.13, wspace=0.04)
+    _legend(figure, names, component, colors)
+    figure.subplots_adjust(
+        left=0.01,
+        right=0.99,
+        top=1 - 0.44 / height,
+        bottom=0.64 / height,
+        wspace=0.04,
+        hspace=0.1,
+    )
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     with atomic_write(path, "wb") as file:
@@ -74,15 +88,18 @@ def _draw_solid(
     after: list[np.ndarray],
     keep: np.ndarray,
     colors: np.ndarray,
+    first: bool,
 ) -> None:
+    """One row: what was given, if it is the first, the model and a cut through it."""
     model = [x for x, k in zip(after, keep, strict=True) if k]
     model_colors = colors[keep]
     axes_of_model, centre = principal_axes(np.concatenate(model))
     camera = tilt(20.0, 25.0) @ axes_of_model
-    # The first panel sees the frames as they came, about their common middle.
-    middle = np.median(np.concatenate(before), axis=0)
-    _show(axes[0], [(x - middle) @ camera.T for x in before], colors)
-    axes[0].set_title("before: as given")
+    if first:
+        # The first panel sees the frames as they came, about their common middle.
+        middle = np.median(np.concatenate(before), axis=0)
+        _show(axes[0], [(x - middle) @ camera.T for x in before], colors)
+        axes[0].set_title("before: as given")
     _show(axes[1], [(x - centre) @ camera.T for x in model], model_colors)
     axes[1].set_title("after: one frame")
     section, width = _section([(x - centre) @ axes_of_model.T for x in model])
@@ -99,16 +116,19 @@ def _draw_flat(
     after: list[np.ndarray],
     keep: np.ndarray,
     colors: np.ndarray,
+    first: bool,
 ) -> None:
     size = float(np.clip(400 / np.sqrt(max(len(x) for x in before)), 2, 7))
     for k, color in enumerate(colors):
         # Later ones smaller, so that points which coincide are both seen.
         s = size * (1.3 - 0.7 * k / max(len(colors) - 1, 1))
         style = {"color": color, "markersize": s, "markeredgewidth": 0}
-        axes[0].plot(*before[k].T, "o", **style)
+        if first:
+            axes[0].plot(*before[k].T, "o", **style)
         if keep[k]:
             axes[1].plot(*after[k].T, "o", **style)
-    axes[0].set_title("before: as given")
+    if first:
+        axes[0].set_title("before: as given")
     axes[1].set_title("after: one frame")
 
 
@@ -148,7 +168,7 @@ def _section(parts: list[np.ndarray]) -> tuple[list[np.ndarray], float]:
 
 
 def _legend(
-    figure: Any, names: Sequence[str], keep: np.ndarray, colors: np.ndarray
+    figure: Any, names: Sequence[str], component: np.ndarray, colors: np.ndarray
 ) -> None:
     if len(names) > 24:
         return
@@ -157,7 +177,10 @@ def _legend(
         lines.Line2D([], [], color=c, marker="o", linestyle="", markersize=5)
         for c in colors
     ]
-    labels = [n if k else f"{n} (not placed)" for n, k in zip(names, keep, strict=True)]
+    labels = [
+        n + (f" (component {k})" if k > 0 else "" if k == 0 else " (not placed)")
+        for n, k in zip(names, component, strict=True)
+    ]
     figure.legend(
         handles,
         labels,

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -176,6 +177,15 @@ def test_a_viewpoint_is_moved_with_each_scan(
     assert "--viewpoint: wanted 3 finite numbers" in capsys.readouterr().err
 
 
+def _write_truth(folder: Path, scans: list[str], poses: np.ndarray) -> None:
+    lines = []
+    for name, T in zip(scans, poses, strict=True):
+        half = 0.5 * np.arctan2(T[1, 0], T[0, 0])
+        t = " ".join(map(str, T[:3, 3]))
+        lines.append(f"bmesh {name} {t} 0 0 {-np.sin(half)} {np.cos(half)}")
+    (folder / "truth.conf").write_text("\n".join(lines).replace(".npy", ".ply"))
+
+
 def test_truth_adds_errors(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -183,12 +193,7 @@ def test_truth_adds_errors(
     wrong = POSES.copy()
     wrong[2] = wrong[2] @ _turned(0.01, 0.0) @ _shift(np.array([0.0, -1.0, -2.0]))
     _fake_reconstruct(monkeypatch, wrong, [True] * 3)
-    lines = []
-    for name, T in zip(scans, POSES, strict=True):
-        half = 0.5 * np.arctan2(T[1, 0], T[0, 0])
-        t = " ".join(map(str, T[:3, 3]))
-        lines.append(f"bmesh {name} {t} 0 0 {-np.sin(half)} {np.cos(half)}")
-    (folder / "truth.conf").write_text("\n".join(lines).replace(".npy", ".ply"))
+    _write_truth(folder, scans, POSES)
     assert main(["multiview", *scans, "--truth", "truth.conf"]) == 0
     errors = json.loads(Path("jaxreg-out/result.json").read_text())["errors"]
     assert errors["names"] == ["s0", "s1", "s2"]
@@ -231,6 +236,28 @@ def test_a_second_object_is_a_model_of_its_own(
     # In the frame of t0.npy, the first scan of its component.
     np.testing.assert_allclose(own[:40], _seen_from(POSES[0]), atol=1e-5)
     np.testing.assert_allclose(own[40:], own[:40], atol=1e-5)
+    # A later run with one component leaves nothing of the other behind.
+    (folder / "jaxreg-out" / "merged_2.ply").write_text("mine")
+    _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans[:3]]) == 0
+    assert sorted(os.listdir("jaxreg-out")) == sorted([*FILES, "merged_2.ply"])
+
+
+def test_errors_of_a_second_object_are_told(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = [*_save_scans(folder), "t0.npy", "t1.npy"]
+    shutil.copy("s0.npy", "t0.npy")
+    shutil.copy("s1.npy", "t1.npy")
+    found = POSES[[0, 1, 2, 0, 1]]
+    found[4] = found[4] @ _turned(0.01, 0.0)
+    _fake_reconstruct(monkeypatch, found, [True] * 3 + [False] * 2, [0, 0, 0, 1, 1])
+    _write_truth(folder, scans, POSES[[0, 1, 2, 0, 1]])
+    assert main(["multiview", *scans, "--truth", "truth.conf"]) == 0
+    errors = json.loads(Path("jaxreg-out/result.json").read_text())["errors"]
+    assert errors["component"] == [0, 0, 0, 1, 1]
+    np.testing.assert_allclose(errors["e_R"], [0, 0, 0, 0, 0.01], atol=1e-5)
+    assert "t1, component 1" in capsys.readouterr().out
 
 
 def test_scans_without_overlap_are_named_and_nothing_is_written(
@@ -270,7 +297,9 @@ def _modes(T: np.ndarray) -> SimpleNamespace:
     )
 
 
-def _register_s1_onto_s0(source: np.ndarray, target: np.ndarray, *, key: Any) -> Any:
+def _register_s1_onto_s0(
+    source: np.ndarray, target: np.ndarray, method: Any, *, key: Any
+) -> Any:
     assert np.isfinite(source).all()
     T = _shift(-np.median(CLOUD, axis=0)) @ POSES[1] @ _shift(_middle_of(POSES[1]))
     return SimpleNamespace(
@@ -307,7 +336,7 @@ def test_register_without_overlap_exits_with_2(
 ):
     _save_scans(folder)
 
-    def register(source: np.ndarray, target: np.ndarray, *, key: Any) -> Any:
+    def register(source: np.ndarray, target: np.ndarray, method: Any, **_: Any) -> Any:
         return SimpleNamespace(
             T_target_source=jnp.full((4, 4), jnp.nan),
             status=jnp.asarray(status),
@@ -359,6 +388,9 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "out is a file": ([m, *pair, "--out", "occupied"], "occupied"),
         "out below a file": ([r, *pair, "--out", "occupied/x"], "occupied"),
         "demo out": (["demo", "--out", "occupied"], "occupied"),
+        "no budget": ([m, *pair, "--budget", "3"], "--budget 3: wanted a number"),
+        "no steps": ([a, "g.g2o", "--budget", "0"], "--budget 0: wanted at least 1"),
+        "no such device": (["demo", "--device", "tpu"], "--device tpu: JAX finds none"),
         "bad seed": ([m, *pair, "--seed", "-1"], "--seed -1"),
         "truth missing": ([m, *pair, "--truth", "none.conf"], "none.conf"),
         "truth of others": ([m, *pair, "--truth", "other.conf"], "other.conf"),
@@ -369,7 +401,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
     }
 
 
-@pytest.mark.parametrize("kind", range(21))
+@pytest.mark.parametrize("kind", range(24))
 def test_bad_input_is_named_in_two_lines_with_exit_code_2(
     folder: Path, capsys: pytest.CaptureFixture[str], kind: int
 ):
@@ -433,6 +465,7 @@ def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
     # Pairs of another run are not taken for those of this one, nor lost.
     assert main(["multiview", *scans, "--resume", "--seed", "1"]) == 2
     assert "another seed" in capsys.readouterr().err
+    assert kept.exists()
     given = _fake_reconstruct(monkeypatch, POSES, [True] * 3)
     assert main(["multiview", *scans, "--resume", "--order", "sequential"]) == 0
     options = given[0][2]
@@ -454,6 +487,37 @@ def test_a_missing_extra_is_said_in_two_lines(
     message = capsys.readouterr().err
     assert "rich" in message
     assert "pip install 'jaxreg[app]'" in message
+
+
+def test_budget_and_precision_reach_the_search(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    scans = _save_scans(folder)
+    given = _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    options = ["--budget", "100", "--precision", "float64", "--device", "cpu"]
+    assert main(["multiview", *scans, *options]) == 0
+    found, _, settings = given[0]
+    assert all(scan.dtype == np.float64 for scan in found)
+    method = settings["method"]
+    assert (method.num_prior, method.num_particles) == (100, 100)
+    assert jnp.zeros(()).dtype == jnp.float32  # the setting ends with the command
+    told = json.loads(Path("jaxreg-out/result.json").read_text())
+    np.testing.assert_allclose(told["T_world_i"], POSES, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "command", ["demo", "register", "multiview", "average", "info"]
+)
+def test_help_tells_the_default_of_every_option(
+    capsys: pytest.CaptureFixture[str], command: str
+):
+    with pytest.raises(SystemExit) as caught:
+        main([command, "--help"])
+    assert caught.value.code == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    options = re.findall(r" (--[a-z]+)(?= )(?:(?! --[a-z]).)*", text.split("exit")[1])
+    assert "--json" in options
+    assert len(options) == text.split("exit")[1].count("(default: ")
 
 
 def test_version(capsys: pytest.CaptureFixture[str]):
@@ -555,6 +619,7 @@ def test_python_m_jaxreg_is_the_command(tmp_path: Path):
     [
         (["average", "g.g2o", "--metod", "plain"], "--method"),
         (["multiview", "--sed", "3"], "--seed"),
+        (["demo", "--devise", "cpu"], "--device"),
         (["registr", "a", "b"], "register"),
     ],
 )

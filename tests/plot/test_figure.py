@@ -28,13 +28,24 @@ def test_reconstruction_figure_shows_points(tmp_path: Path, d: int):
     T = np.tile(np.eye(d + 1), (3, 1, 1))
     T[2, :d, d] = 100.0
     path = tmp_path / "figure.png"
-    reconstruction_figure(path, scans, T, ["a", "b", "c"], placed=[True, True, False])
+    reconstruction_figure(path, scans, T, ["a", "b", "c"], component=[0, 0, -1])
     image = matplotlib.image.imread(path)
     width = image.shape[1]
     panels = 3 if d == 3 else 2
     for k in range(panels):
         panel = image[80:-90, k * width // panels : (k + 1) * width // panels, :3]
         assert np.mean(np.any(panel < 0.95, axis=-1)) > 0.001
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_component_has_a_row(tmp_path: Path, d: int):
+    scans = [_sphere(800)[:, :d] for _ in range(4)]
+    T = np.tile(np.eye(d + 1), (4, 1, 1))
+    path = tmp_path / "figure.png"
+    reconstruction_figure(path, scans, T, list("abcd"), component=[0, 0, 1, 1])
+    image = matplotlib.image.imread(path)
+    row = image[image.shape[0] // 2 : -90, image.shape[1] // 3 :, :3]
+    assert np.mean(np.any(row < 0.95, axis=-1)) > 0.001
 
 
 def test_flat_and_tiny_clouds_do_not_break_the_figure(tmp_path: Path):
