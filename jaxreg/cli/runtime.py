@@ -132,7 +132,7 @@ class Session:
 
 
 def _use_device(kind: str) -> None:
-    before = jax.config.read("jax_platforms")
+    before = jax.config.values["jax_platforms"]
     platforms = {"gpu": ("cuda", "rocm")}.get(kind, (kind,))
     for platform in platforms:
         jax.config.update("jax_platforms", platform)
