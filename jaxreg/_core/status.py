@@ -20,6 +20,7 @@ class Status(enum.IntEnum):
     AMBIGUOUS = 6
     DISCONNECTED = 7
     DIVERGED = 8
+    UNIT_DIFFERS = 9
 
     @property
     def advice(self) -> str:
@@ -57,6 +58,10 @@ _ADVICE = {
     Status.DIVERGED: (
         "The steps led to a worse pose than the initial guess, which is returned. "
         "Start nearer, use a robust kernel, or search with ParticleFilter."
+    ),
+    Status.UNIT_DIFFERS: (
+        "The scan is many times larger or smaller than the others, and was left out. "
+        "Is it in another unit? Bring all scans to one unit."
     ),
     Status.DISCONNECTED: (
         "The trusted edges do not reach every pose. See `placed`, and `component` "

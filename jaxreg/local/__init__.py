@@ -18,9 +18,11 @@ from jaxreg.local.residuals import PointToPlane as PointToPlane
 from jaxreg.local.residuals import PointToPoint as PointToPoint
 from jaxreg.local.residuals import Symmetric as Symmetric
 from jaxreg.local.score import Score as Score
+from jaxreg.local.score import agreeing as agreeing
 from jaxreg.local.score import mutual_overlap as mutual_overlap
 from jaxreg.local.score import score as score
 from jaxreg.local.score import score_both_ways as score_both_ways
+from jaxreg.local.slippage import Grip as Grip
 from jaxreg.local.slippage import can_slip as can_slip
 from jaxreg.local.steps import AbstractStep as AbstractStep
 from jaxreg.local.steps import ClosedForm as ClosedForm

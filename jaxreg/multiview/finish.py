@@ -1,7 +1,7 @@
 """From the motions of pairs to the answer: poses, statuses, trust."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.compile import compiled
 from jaxreg._core.status import Status
@@ -14,6 +14,7 @@ from jaxreg.multiview.place import Placement, place
 from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative import RelativeMotions
 from jaxreg.multiview.scans import PreparedScans
+from jaxreg.multiview.slip import slipping
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.particle import ParticleFilter
 
@@ -38,9 +39,12 @@ def finish(
     placement = place(motions, scans.num_scans, averaging, min_overlap)
     placement = refine(scans, placement, averaging, min_overlap / 2)
     if hold is None:
-        return _solution(scans, motions, placement, min_overlap)
+        slips = slipping(scans, placement, min_overlap)
+        return _solution(scans, motions, placement, slips, min_overlap)
     placement = hold.place(scans, placement, averaging, min_overlap / 2)
-    return hold.in_world(_solution(scans, motions, placement, min_overlap))
+    slips = slipping(scans, placement, min_overlap) & ~hold.held
+    solution = _solution(scans, motions, placement, slips, min_overlap)
+    return hold.in_world(solution)
 
 
 @compiled
@@ -48,6 +52,7 @@ def _solution(
     scans: PreparedScans,
     motions: RelativeMotions,
     placement: Placement,
+    slips: Bool[Array, " v"],
     min_overlap: Scalar,
 ) -> ReconstructionSolution:
     """In the frames and unit of the input."""
@@ -58,12 +63,13 @@ def _solution(
     component, placed = placement.component, placement.placed
     scan_status = jnp.where(component < 0, Status.LOW_OVERLAP, Status.DISCONNECTED)
     scan_status = jnp.where(placed, Status.CONVERGED, scan_status)
-    scan_status = jnp.where(scans.enough, scan_status, Status.TOO_FEW_POINTS)
+    scan_status = jnp.where(slips, Status.AMBIGUOUS, scan_status)
+    scan_status = jnp.where(scans.usable, scan_status, scans.fault)
+    status = jnp.where(jnp.any(slips), Status.AMBIGUOUS, Status.CONVERGED)
+    status = jnp.where(jnp.all(placed), status, Status.DISCONNECTED)
     return ReconstructionSolution(
         T_world_i=_in_first_frames(scans, placement),
-        status=jnp.where(jnp.all(placed), Status.CONVERGED, Status.DISCONNECTED).astype(
-            jnp.int32
-        ),
+        status=status.astype(jnp.int32),
         scan_status=scan_status.astype(jnp.int32),
         placed=placed,
         component=component,

@@ -55,7 +55,7 @@ def descended(
         T = lie.orthonormalise(coarse.repeat(problem, T, widths))
         there, back = score_both_ways(*clouds, T[None], jnp.ones(1, bool), spacing)
         T = fine.repeat(problem, T, jnp.full(_POLISH, 0.5 * spacing, dtype))
-        sound = scans.enough[i] & scans.enough[j] & jnp.all(jnp.isfinite(T))
+        sound = scans.usable[i] & scans.usable[j] & jnp.all(jnp.isfinite(T))
         return RelativeMotions(
             row[0],
             jnp.where(sound, lie.orthonormalise(T), jnp.eye(len(T), dtype=dtype)),

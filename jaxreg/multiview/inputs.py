@@ -17,10 +17,12 @@ from jaxreg._core.padding import rounded_up, stacked
 
 # A viewpoint lies on a point if it is nearer than this share of the scan's extent.
 _ON_POINT = 1e-6
+# Scans are thinned to some thousand points; of very large ones so many are enough.
+_MOST_POINTS = 1 << 19
 
 
 def padded_scans(scans: object, mask: object) -> tuple[Array, Array]:
-    """Scans as `(v, n, d)` with a mask."""
+    """Scans as `(v, n, d)` with a mask; points of very large ones in a list drawn."""
     if isinstance(scans, Sequence):
         if mask is not None:
             raise ValueError("mask: only for a padded array, not for a list of scans.")
@@ -34,6 +36,7 @@ def padded_scans(scans: object, mask: object) -> tuple[Array, Array]:
                 )
         if len(arrays) < 2:
             raise ValueError(f"scans: wanted two or more, found {len(arrays)}.")
+        arrays = [_drawn(x) for x in arrays]
         dtype = jnp.result_type(*arrays)
         lengths = np.array([len(x) for x in arrays])
         rows = rounded_up(max(lengths.tolist()))
@@ -47,6 +50,14 @@ def padded_scans(scans: object, mask: object) -> tuple[Array, Array]:
             f"(v, n, d), found shape {points.shape}."
         )
     return points, check_mask(mask, points.shape[:2], "mask")
+
+
+def _drawn(points: Float[Array, "n d"]) -> Float[Array, "m d"]:
+    """All points, or as many at random as are enough; the same ones every time."""
+    n = len(points)
+    if n <= _MOST_POINTS:
+        return points
+    return points[np.sort(np.random.default_rng(n).permutation(n)[:_MOST_POINTS])]
 
 
 def checked_viewpoints(

@@ -46,7 +46,8 @@ def reconstruct(
     hang by a thread.
 
     Args:
-        scans: a list of `(n_i, d)` point sets, or a padded array `(v, n, d)`.
+        scans: a list of `(n_i, d)` point sets, or a padded array `(v, n, d)`. Of a
+            scan in a list that has more than 524,288 points so many are drawn.
         key: a `jax.random.key`; the same key gives the same answer.
         method: the search between pairs, `ParticleFilter()` by default.
         averaging: how relative motions become poses; None for `Correntropy` from the
@@ -76,7 +77,8 @@ def reconstruct(
         ValueError, TypeError: while tracing, for shapes and types that do not fit.
 
     Fails:
-        DISCONNECTED where some scans could not be placed; `scan_status` says which.
+        DISCONNECTED where some scans could not be placed, AMBIGUOUS where some can slip
+        along the others; `scan_status` says which, and what is wrong with them.
 
     Gradients:
         None; the search is cut.

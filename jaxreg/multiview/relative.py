@@ -92,7 +92,7 @@ def relative_motions(
             None,
             jax.random.fold_in(jax.random.fold_in(key, i), j),
         )
-        usable = scans.enough[i] & scans.enough[j]
+        usable = scans.usable[i] & scans.usable[j]
         return RelativeMotions(
             pair,
             solution.T_target_source,

@@ -6,11 +6,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.status import Status
 from jaxreg._core.typing import Motions, Scalar
 from jaxreg.cloud import PointCloud, centroid, median_spacing, rms_radius
 from jaxreg.geometry import lie
 from jaxreg.neighbours import VoxelTable
 from jaxreg.particle import ParticleFilter
+
+
+# A scan this many times larger or smaller than the median is in another unit.
+_OTHER_UNIT = 50.0
 
 
 class PreparedScans(eqx.Module):
@@ -23,7 +28,9 @@ class PreparedScans(eqx.Module):
         mean: `(v, d)` centroid of each scan in its input frame.
         radius: the median root mean square radius of the scans, in the input's unit.
         spacing: `(v,)` distance between thinned points, in units of `radius`.
-        enough: `(v,)` False for scans of fewer than d + 1 valid points.
+        fault: `(v,)` int32, what is wrong with a scan: TOO_FEW_POINTS, fewer than d + 1
+            valid ones; UNIT_DIFFERS, its radius is not of the others' order; CONVERGED,
+            nothing.
         num_dropped: `(v,)` rows of the input that were not finite.
     """
 
@@ -32,13 +39,18 @@ class PreparedScans(eqx.Module):
     mean: Float[Array, "v d"]
     radius: Scalar
     spacing: Float[Array, " v"]
-    enough: Bool[Array, " v"]
+    fault: Int[Array, " v"]
     num_dropped: Int[Array, " v"]
 
     @property
     def num_scans(self) -> int:
         """V."""
         return self.mean.shape[0]
+
+    @property
+    def usable(self) -> Bool[Array, " v"]:
+        """Which scans can be registered."""
+        return self.fault == Status.CONVERGED
 
     def cloud(self, i: Int[Array, ""]) -> PointCloud:
         """One scan's thinned points."""
@@ -112,5 +124,15 @@ def prepare_scans(
     if viewpoints is not None:
         eyes = (viewpoints - mean) / radius
         clouds = lax.map(lambda scan: scan[0].seen_from(scan[1]), (clouds, eyes))
-    enough = (jnp.sum(clouds.mask, axis=1) > points.shape[-1]) & (spacing > 0)
-    return PreparedScans(clouds, tables, mean, radius, spacing, enough, dropped)
+    fault = _fault(clouds, jax.vmap(rms_radius)(points, mask) / radius, spacing)
+    return PreparedScans(clouds, tables, mean, radius, spacing, fault, dropped)
+
+
+def _fault(
+    clouds: PointCloud, size: Float[Array, " v"], spacing: Float[Array, " v"]
+) -> Int[Array, " v"]:
+    """What is wrong with each scan, see `PreparedScans`."""
+    differs = (size > _OTHER_UNIT) | (size < 1 / _OTHER_UNIT)
+    fault = jnp.where(differs, Status.UNIT_DIFFERS, Status.CONVERGED)
+    enough = (jnp.sum(clouds.mask, axis=1) > clouds.points.shape[-1]) & (spacing > 0)
+    return jnp.where(enough, fault, Status.TOO_FEW_POINTS).astype(jnp.int32)

@@ -208,6 +208,50 @@ def test_bad_scans_are_reported_and_the_others_placed(sculpture):
         assert pose_error(sol.T_world_i[i], T_true)[0] < 0.03
 
 
+def test_spheres_are_ambiguous(sculpture):
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((8, 3000, 3))
+    x /= np.linalg.norm(x, axis=2, keepdims=True)
+    spheres = list((0.1 * x).astype(np.float32))
+    sol = jr.reconstruct(spheres, key=jax.random.key(0), method=FILTER)
+    assert int(sol.status) == Status.AMBIGUOUS
+    assert np.sum(np.asarray(sol.scan_status) == Status.AMBIGUOUS) >= 7
+
+
+def test_identical_scans_lie_on_each_other(sculpture):
+    same = [sculpture[0][0]] * 8
+    sol = jr.reconstruct(same, key=jax.random.key(0), method=FILTER)
+    assert int(sol.status) == Status.CONVERGED
+    for T in sol.T_world_i:
+        angle, shift = pose_error(T, np.eye(4))
+        assert angle < 1e-3
+        assert shift < 1e-4
+
+
+def test_scans_in_another_unit_are_left_out(sculpture):
+    scans, truth = sculpture
+    mixed = list(scans)
+    mixed[3], mixed[6] = 1000 * scans[3], scans[6] / 1000
+    sol = jr.reconstruct(mixed, key=jax.random.key(0), method=FILTER)
+    assert int(sol.status) == Status.DISCONNECTED
+    for i in (3, 6):
+        assert Status(int(sol.scan_status[i])) == Status.UNIT_DIFFERS
+        assert not sol.placed[i]
+    assert np.array(_errors(sol, truth))[np.asarray(sol.placed), 0].max() < 0.02
+    assert np.sum(sol.placed) >= 5
+
+
+def test_a_scan_of_many_points_is_taken_as_any_other(sculpture):
+    scans, truth = sculpture
+    rng = np.random.default_rng(0)
+    many = scans[1][rng.integers(0, 3000, 2_000_000)]
+    many += 1e-4 * rng.standard_normal(many.shape, np.float32)
+    sol = jr.reconstruct([scans[0], many], key=jax.random.key(0), method=FILTER)
+    angle, shift = pose_error(sol.T_world_i[1], np.linalg.inv(truth[0]) @ truth[1])
+    assert angle < 0.02
+    assert shift < 0.004
+
+
 def test_two_objects_make_two_components(sculpture):
     scans, truth = sculpture
     # Views of a second object in place of the last three.
