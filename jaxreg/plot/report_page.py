@@ -11,7 +11,15 @@ from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import MissingExtraError
 
 
-_SCRIPTS = ("base.js", "view.js", "section.js", "pairs.js", "graph.js", "tables.js")
+_SCRIPTS = (
+    "base.js",
+    "view.js",
+    "section.js",
+    "pairs.js",
+    "graph.js",
+    "residuals.js",
+    "tables.js",
+)
 
 
 def write_page(path: str | Path, title: str, data: dict[str, Any]) -> None:

@@ -28,8 +28,8 @@ class PagePoints:
         local: `(n_i, d)` float64 in the frame of each scan.
         world: `(n_i, d)` float64 in the common frame.
         light: `(n_i,)` uint8, how bright a point is drawn.
-        distance: `(n_i,)` uint8, to the nearest point of the other placed scans, 254
-            being `far`, 255 anything farther.
+        distance: `(n_i,)` uint8, to the nearest point of the other scans of the same
+            component, 254 being `far`, 255 anything farther.
         far: upper end of the scale of distances, in the unit of the scans.
     """
 
@@ -43,7 +43,7 @@ class PagePoints:
 def page_points(
     scans: Sequence[np.ndarray],
     T_world_i: np.ndarray,
-    placed: np.ndarray,
+    component: np.ndarray,
     camera: np.ndarray | None = None,
 ) -> PagePoints:
     """Thins scans to `MAX_POINTS` in all and measures them against the full ones.
@@ -51,7 +51,7 @@ def page_points(
     Args:
         scans: `(n_i, d)` arrays; rows with NaN or inf are left out.
         T_world_i: `(v, d+1, d+1)` poses.
-        placed: `(v,)` which of them mean something.
+        component: `(v,)` those that share one number share a frame, -1 has none.
         camera: `(3, 3)` rows right, up and towards the viewer; None for 2D.
     """
     step = 1 + sum(map(len, scans)) // _MAX_REFERENCE
@@ -61,12 +61,13 @@ def page_points(
     world = [_move(T, x) for T, x in zip(T_world_i, local, strict=True)]
     trees = [KDTree(x) for x in full]
     light = [np.full(len(x), 200, np.uint8) for x in local]
-    centre = np.median(np.concatenate(world), axis=0)
     for i, x in enumerate(local):
         if camera is not None and len(x):
+            model = [world[j] for j in np.flatnonzero(component == component[i])]
+            centre = np.median(np.concatenate(model), axis=0)
             normal = _normals(trees[i], x) @ T_world_i[i][:3, :3].T
             light[i] = _light(_outward(normal, world[i] - centre) @ camera.T)
-    distance, far = _distances(trees, world, T_world_i, placed)
+    distance, far = _distances(trees, world, T_world_i, component)
     return PagePoints(local, world, light, distance, far)
 
 
@@ -160,11 +161,12 @@ def _distances(
     trees: list[KDTree],
     world: list[np.ndarray],
     T_world_i: np.ndarray,
-    placed: np.ndarray,
+    component: np.ndarray,
 ) -> tuple[list[np.ndarray], float]:
-    bound = 0.05 * float(np.max(np.ptp(np.concatenate(world), axis=0)))
+    model = [w for w, k in zip(world, component, strict=True) if k == 0]
+    bound = 0.05 * float(np.max(np.ptp(np.concatenate(model), axis=0)))
     found = [np.full(len(x), np.inf) for x in world]
-    ids = np.flatnonzero(placed)
+    ids = np.flatnonzero(component >= 0)
     boxes = {
         j: (_corners(trees[j], T_world_i[j]), np.linalg.inv(T_world_i[j])) for j in ids
     }
@@ -172,7 +174,7 @@ def _distances(
         for j in ids:
             (low, high), T_j_world = boxes[j]
             near = ((world[i] > low - bound) & (world[i] < high + bound)).all(axis=1)
-            if i == j or not near.any():
+            if i == j or component[i] != component[j] or not near.any():
                 continue
             moved = _move(T_j_world, world[i][near])
             d, _ = trees[j].query(moved, distance_upper_bound=bound, workers=-1)

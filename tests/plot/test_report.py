@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import pytest
@@ -76,7 +78,7 @@ def test_the_page_is_one_file_and_text_in_it_stays_text(tmp_path: Path):
 def test_points_keep_their_place_and_distance():
     scans, result = _result(3, 3, list("abc"))
     scans[0][3] = np.nan
-    points = page_points(scans, result.T_world_i, result.placed, np.eye(3))
+    points = page_points(scans, result.T_world_i, result.component, np.eye(3))
     assert [len(x) for x in points.local] == [349, 350, 349]
     code = encode_points(points)
     xyz = np.frombuffer(base64.b64decode(code["xyz"]), "<i2").reshape(-1, 3)
@@ -99,7 +101,7 @@ def test_large_scans_are_thinned_and_small_ones_are_not(
     rng = np.random.default_rng(0)
     large, small = rng.normal(size=(9000, 2)), rng.normal(size=(100, 2))
     T = np.tile(np.eye(3), (2, 1, 1))
-    points = page_points([large, small], T, np.ones(2, bool))
+    points = page_points([large, small], T, np.zeros(2, int))
     assert 500 < len(points.local[0]) <= 900
     assert len(points.local[1]) == 100
     # Six bytes a point and two of colour, in base64: the page stays below 6.5 MB.
@@ -113,7 +115,7 @@ def test_scans_without_points_or_poses_do_not_break_the_page(tmp_path: Path):
     write_report(tmp_path / "a.html", scans, result)
     data = _data(tmp_path / "a.html")
     assert data["points"]["count"][2] == 0
-    assert not data["scans"][2]["placed"]
+    assert data["scans"][2]["component"] == -1
     with pytest.raises(ValueError, match="scans: wanted 3 like the poses, found 2"):
         write_report(tmp_path / "b.html", scans[:2], result)
 
@@ -156,6 +158,12 @@ def _ink(page: Page, path: Path, selector: str = "#scene") -> float:
     return float(np.mean(np.abs(colors - colors[2, 2]).max(axis=-1) > 0.1))
 
 
+def _drawn(page: Page) -> int:
+    return page.run(
+        "document.getElementById('scene')._fullData.filter(t => t.visible).length"
+    )
+
+
 def _quiet(page: Page) -> None:
     assert page.errors == []
     assert page.requests == []
@@ -165,6 +173,7 @@ def test_scans_in_a_browser(page: Page, tmp_path: Path):
     scans, result = _result(3, 3, EVIL)
     errors = {"names": EVIL, "e_R": [0.0, 0.1, 0.2], "e_t": [0.0, 1.0, 2.0]}
     errors |= {"mean_e_R": 0.1, "mean_e_t": 1.0}
+    result.T_i_j[-1] = motion(7, 3)
     path, shot = tmp_path / "report.html", tmp_path / "shot.png"
     write_report(path, scans, result, errors=errors)
     page.open(path)
@@ -175,27 +184,29 @@ def test_scans_in_a_browser(page: Page, tmp_path: Path):
     assert (
         page.run("document.querySelectorAll('#list .name')[1].textContent") == EVIL[1]
     )
-    drawn = "document.getElementById('scene')._fullData.filter(t => t.visible).length"
-    all_shown = page.run(drawn)  # three scans and the outline of the cut
-    assert all_shown == 4
+    assert _drawn(page) == 4  # three scans and the outline of the cut
     page.click('#when [data-value="before"]')
-    assert page.run(drawn) == 3
+    assert _drawn(page) == 3
     assert _ink(page, shot) > 0.02
     page.click('#when [data-value="after"]')
     page.click('#color [data-value="distance"]')
     assert page.run("!document.getElementById('scale').hidden")
     page.click("#list input")
-    assert page.run(drawn) == 3
+    assert _drawn(page) == 3
     page.click("#none")
-    assert page.run(drawn) == 1
+    assert _drawn(page) == 1
     assert _ink(page, shot) < after / 4
     page.click("#all")
-    # A distrusted pair: the two scans alone, and back.
+    # A distrusted pair: the two scans alone, as the pair has them, and back.
     page.click(".edge.off")
     assert page.run("document.querySelector('#only').textContent").startswith(EVIL[1])
-    assert page.run(drawn) == 3
+    assert _drawn(page) == 3
+    x = "document.getElementById('scene').data[2].x[0]"
+    by_poses = page.run(x)
+    page.click("#own")
+    assert page.run(x) != by_poses
     page.click("#every")
-    assert page.run(drawn) == 4
+    assert _drawn(page) == 4
     at = "document.getElementById('cut-at').textContent"
     earlier = page.run(at)
     page.run(
@@ -205,6 +216,38 @@ def test_scans_in_a_browser(page: Page, tmp_path: Path):
     page.settle()
     assert page.run(at) != earlier
     assert "mean" in page.run("document.getElementById('poses').textContent")
+    _quiet(page)
+
+
+def test_components_are_shown_in_turn(page: Page, tmp_path: Path):
+    scans, result = _result(3, 5, list("abcde"))
+    result.component[:] = [0, 0, 0, 1, 1]
+    between = result.component[result.edges].min(axis=1) == 0
+    result.weight[between & (result.edges[:, 1] > 2)] = 0
+    result.weight[-1] = 1
+    path = tmp_path / "report.html"
+    write_report(path, scans, result)
+    data = _data(path)
+    # The poses of three scans close a cycle, those of two are not known so well.
+    sigma = np.array([s["sigma"] for s in data["scans"]], float)
+    assert np.isfinite(sigma[:3]).all()
+    assert (sigma[1:3] >= 0).all()
+    assert np.isnan(sigma[3:]).all()
+    assert data["pairs"][2]["angle"] is None
+    page.open(path)
+    assert _drawn(page) == 4
+    page.click('#model [data-value="1"]')
+    assert _drawn(page) == 3
+    assert _ink(page, tmp_path / "shot.png") > 0.02
+    # Scans of two components are shown as their pair has them.
+    page.click(".edge.off")
+    assert "by the motion of the pair" in page.run(
+        "document.querySelector('#only').textContent"
+    )
+    assert _drawn(page) == 3
+    page.click('#model [data-value="0"]')
+    assert _drawn(page) == 4
+    assert "component 1" in page.run("document.getElementById('poses').textContent")
     _quiet(page)
 
 
@@ -251,8 +294,17 @@ def test_graphs_in_a_browser(page: Page, tmp_path: Path, d: int):
     graph = jaxreg.PoseGraph.from_edges(edges, T_i_j.astype(np.float32))
     before = jaxreg.average(graph, method=jaxreg.SpanningTree())
     path = tmp_path / "report.html"
-    write_graph_report(path, graph, before, before)
+    after = eqx.tree_at(
+        lambda s: (s.kernel_width, s.edge_weight),
+        before,
+        (jnp.array([0.1, 0.05]), before.edge_weight.at[-1].set(0)),
+    )
+    write_graph_report(path, graph, after, before)
     page.open(path)
+    assert _ink(page, tmp_path / "shot.png", "#residuals") > 0.001
+    assert "kernel width" in page.run("document.getElementById('tiles').textContent")
+    lines = "document.getElementById('residuals').layout.shapes.length"
+    assert page.run(lines) == 2
     assert _ink(page, tmp_path / "shot.png") > 0.002
     page.click('#when [data-value="before"]')
     page.click("#list input")

@@ -14,14 +14,18 @@ const state = {
   color: "scan", // or "distance"
   shown: SCANS ? DATA.scans.map(() => true) : { chain: true, loops: true, off: true },
   only: null, // a pair of scans that is shown alone
+  own: false, // whether by its own motion, not by the final poses
+  model: 0, // the component that is shown
   mode: 0,
   axis: 0,
   cut: 0.5,
   edge: null, // an edge of a graph that is drawn thick
 };
+const NUM_MODELS = SCANS ? 1 + Math.max(0, ...DATA.scans.map((s) => s.component)) : 1;
 const listeners = [];
 
 function change(part) {
+  if ("only" in part && !("own" in part)) state.own = false;
   Object.assign(state, part);
   for (const listener of listeners) listener(part);
 }
@@ -72,12 +76,12 @@ function heat(code) {
   return mix(HEAT[k], HEAT[k + 1], t - k);
 }
 
-// A row of buttons of which one is pressed.
-function choice(id, options, key) {
+// A row of buttons of which one is pressed; a click sets `also`, too.
+function choice(id, options, key, also = {}) {
   const box = $(id);
   const buttons = options.map(([value, label]) => {
     const button = el("button", { type: "button", "data-value": value }, label);
-    button.addEventListener("click", () => change({ [key]: value }));
+    button.addEventListener("click", () => change({ [key]: value, ...also }));
     box.append(button);
     return button;
   });

@@ -10,8 +10,18 @@ function samePair(pair) {
   return state.only && state.only[0] === pair.i && state.only[1] === pair.j;
 }
 
+// The pair of two scans, and whether the final poses join them.
+function pairOf([i, j]) {
+  const [a, b] = [DATA.scans[i].component, DATA.scans[j].component];
+  return { joined: a >= 0 && a === b, component: a };
+}
+
 function showPair(pair) {
-  change({ only: samePair(pair) ? null : [pair.i, pair.j] });
+  if (samePair(pair)) return change({ only: null });
+  const only = [pair.i, pair.j];
+  const { joined, component } = pairOf(only);
+  // Scans that the poses do not join are shown as the pair alone would have them.
+  change({ only, own: !joined, when: "after", ...(joined ? { model: component } : {}) });
 }
 
 function ring() {
@@ -65,10 +75,10 @@ function startPairs() {
     "A click shows the two scans alone.";
   if (DATA.scans.length > 2 && DATA.scans.length <= 120) ring();
   const rows = [...DATA.pairs].sort((a, b) => b.weight - a.weight || b.overlap - a.overlap);
-  $("pairs-table").append(table(["pair", "overlap", "weight", "inlier RMSE"],
+  $("pairs-table").append(table(["pair", "overlap", "weight", "inlier RMSE", "off by", "off by [°]"],
     rows.slice(0, 500).map((p) => ({
       cells: [`${DATA.scans[p.i].name} – ${DATA.scans[p.j].name}`, p.overlap.toFixed(2),
-        p.weight.toFixed(2), number(p.rmse, 3)],
+        p.weight.toFixed(2), number(p.rmse, 3), number(p.distance, 3), fixed(degrees(p.angle), 3)],
       onclick: () => showPair(p),
     }))));
 }

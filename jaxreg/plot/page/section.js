@@ -6,7 +6,7 @@ let ORDER = null; // points of all scans in random order, so that no scan hides 
 function cutRange() {
   const { box } = arranged("after");
   const [low, high] = box[state.axis];
-  const total = POINTS.reduce((sum, p, i) => sum + (DATA.scans[i].placed ? p.n : 0), 0);
+  const total = POINTS.reduce((sum, p, i) => sum + (isMember(i, "after") ? p.n : 0), 0);
   // Thick enough for some 1600 points, thin enough to be a cut.
   const width = Math.min(Math.max(1600 / (total + 1), 0.004), 0.03) * (high - low);
   return { low, high, width, at: low + state.cut * (high - low) };
@@ -33,7 +33,7 @@ function shuffled() {
 }
 
 function visibleAfter(i) {
-  return DATA.scans[i].placed && (state.only ? state.only.includes(i) : state.shown[i]);
+  return isMember(i, "after") && (state.only ? state.only.includes(i) : state.shown[i]);
 }
 
 // Where half of the points lie on either side.
@@ -81,7 +81,7 @@ function slabTraces() {
 }
 
 function slabLayout() {
-  const { box } = arranged("after");
+  const { box, key } = arranged("after");
   const [u, v] = slabAxes();
   const axis = (a) => {
     const grow = 0.04 * (box[a][1] - box[a][0]) + 1e-12;
@@ -89,7 +89,7 @@ function slabLayout() {
       showticklabels: false, title: { text: AXES[a], standoff: 2 } };
   };
   return {
-    margin: { l: 24, r: 6, t: 6, b: 24 }, dragmode: "pan", uirevision: String(state.axis),
+    margin: { l: 24, r: 6, t: 6, b: 24 }, dragmode: "pan", uirevision: `${state.axis} ${key}`,
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { color: theme("--soft"), size: 11 }, showlegend: false,
     xaxis: axis(u), yaxis: { ...axis(v), scaleanchor: "x" },
@@ -128,12 +128,16 @@ function drawSlab() {
   });
 }
 
-function startSection() {
-  $("section-card").hidden = false;
-  ORDER = shuffled();
+// The axis across which a cut shows most, and where to begin.
+function chooseCut() {
   const lengths = AXES.map((_, a) => outlineLength(a));
   state.axis = lengths.indexOf(Math.max(...lengths));
   state.cut = middleCut(state.axis);
+}
+
+function startSection() {
+  $("section-card").hidden = false;
+  ORDER = shuffled();
   $("cut").value = 1000 * state.cut;
   choice("axis", AXES.map((name, a) => [a, name]), "axis");
   // The outline in the 3D view follows when the slider rests: it redraws all points.
@@ -144,6 +148,12 @@ function startSection() {
     clearTimeout(rest);
     rest = setTimeout(drawScene, 120);
   });
-  listeners.push(drawSlab);
+  listeners.push((part) => {
+    if ("axis" in part || "model" in part || "only" in part || "own" in part) {
+      state.cut = middleCut(Number(state.axis));
+      $("cut").value = 1000 * state.cut;
+    }
+    drawSlab();
+  });
   drawSlab();
 }

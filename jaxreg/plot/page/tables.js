@@ -28,6 +28,8 @@ function turnOf(T) {
 
 function fixed(x, digits) { return x === null || x === undefined ? "–" : x.toFixed(digits); }
 
+function isPlaced(s) { return SCANS ? s.component >= 0 : s.placed; }
+
 function posesTable() {
   const rows = DATA.scans;
   const withStatus = SCANS;
@@ -42,9 +44,9 @@ function posesTable() {
   const body = rows.map((s) => {
     const name = el("span", {}, ...(s.color
       ? [el("span", { class: "dot", style: `background:${rgb(s.color)}` })] : []), s.name);
-    const t = names.map((_, a) => (s.placed ? number(s.T[a][DATA.dim], 6) : "–"));
-    const r = s.placed ? turnOf(s.T).map((x) => x.toFixed(3)) : turns.map(() => "–");
-    const status = s.placed ? s.status : `${s.status}, not placed`;
+    const t = names.map((_, a) => (isPlaced(s) ? number(s.T[a][DATA.dim], 6) : "–"));
+    const r = isPlaced(s) ? turnOf(s.T).map((x) => x.toFixed(3)) : turns.map(() => "–");
+    const status = s.status + (isPlaced(s) ? s.component ? `, component ${s.component}` : "" : ", not placed");
     return { title: s.name, cells: [name, ...(withStatus ? [status] : []), ...t, ...r,
       ...(withSigma ? [number(s.sigma[0], 2), fixed(degrees(s.sigma[1]), 4)] : []),
       ...(withErrors ? [number(s.e_t, 3), fixed(degrees(s.e_R), 4)] : [])] };
@@ -55,7 +57,9 @@ function posesTable() {
   }
   const more = SCANS || DATA.num_poses <= rows.length ? ""
     : ` The first ${rows.length} of ${DATA.num_poses}; poses.tum holds all.`;
-  const sigma = withSigma ? " σ assumes independent errors of the points." : "";
+  const noise = SCANS && DATA.scans.length > 2 ? "what the trusted pairs show as noise"
+    : "independent errors of the points";
+  const sigma = withSigma ? ` σ is by ${noise}.` : "";
   $("poses-note").textContent = "From each frame to the common one: translation in the " +
     `unit of the input, rotation ${FLAT ? "angle" : "vector"} in degrees.${sigma}${more}`;
   $("poses").append(table(heads, body));
@@ -70,11 +74,12 @@ function header() {
     $("advice").textContent = advice;
   }
   if (SCANS) {
-    const placed = DATA.scans.filter((s) => s.placed).length;
+    const placed = DATA.scans.filter((s) => s.component === 0).length;
     if (DATA.scans.length > 2) {
       const trusted = DATA.pairs.filter((p) => p.weight > 0.5).length;
       tile(`${placed} of ${DATA.scans.length}`, "scans placed", placed < DATA.scans.length ? "warn" : "");
       tile(`${trusted} of ${DATA.pairs.length}`, "pairs trusted");
+      if (NUM_MODELS > 1) tile(NUM_MODELS, "components, each in a frame of its own", "warn");
     } else if (DATA.pairs.length) {
       tile(number(DATA.pairs[0].overlap, 3), "overlap");
       tile(number(DATA.pairs[0].rmse, 3), "inlier RMSE");
@@ -90,6 +95,7 @@ function header() {
       tile(`${number(DATA.details.objective_before)} → ${number(DATA.details.objective_after)}`, "objective, before → after");
     }
     tile(DATA.steps, "steps");
+    tile(number(DATA.residual, 3), "mean residual");
     if (DATA.kernel_width[0] !== null) {
       tile(`${number(DATA.kernel_width[0], 3)}, ${number(degrees(DATA.kernel_width[1]), 3)}°`, "kernel width");
     }
@@ -108,7 +114,7 @@ function details() {
   for (const [key, value] of Object.entries(settings)) add(key, value);
   const clock = Object.entries(times).map(([k, s]) => `${k} ${s.toFixed(1)} s`);
   if (clock.length) add("times", clock.join(", "));
-  for (const [key, value] of Object.entries(versions)) add(key, value);
+  for (const [key, value] of Object.entries(versions)) add(key === "device" ? "computed on" : key, value);
   box.append(list);
 }
 
@@ -117,6 +123,7 @@ posesTable();
 details();
 (SCANS ? startScans() : startGraph()).then(() => {
   if (SCANS && !FLAT) startSection();
+  startResiduals();
   if (SCANS && DATA.pairs.length && DATA.scans.length > 2) startPairs();
   else $("section-card").classList.add("full");
   // Colours of the drawings follow when the system turns dark or light.

@@ -25,8 +25,25 @@ function readPoints() {
   });
 }
 
+function times(A, B) {
+  return A.map((row) => B[0].map((_, c) => row.reduce((s, a, k) => s + a * B[k][c], 0)));
+}
+
+// What is drawn in one frame: a component, or a pair that is shown by its own motion.
+function isMember(i, when) {
+  if (when === "before") return true;
+  if (state.own) return state.only.includes(i);
+  return DATA.scans[i].component === state.model;
+}
+
 function poseOf(i, when) {
   if (when === "before") return null;
+  if (state.own) {
+    const [first, second] = state.only;
+    const T = DATA.scans[first].T;
+    if (i === first) return T;
+    return times(T, DATA.pairs.find((p) => p.i === first && p.j === second).T);
+  }
   return i === 1 && DATA.modes.length ? DATA.modes[state.mode].T : DATA.scans[i].T;
 }
 
@@ -69,10 +86,12 @@ const views = {};
 
 // Coordinates and box of one state of the poses; computed once, then kept.
 function arranged(when) {
-  const key = when === "before" ? "before" : `after ${state.mode}`;
+  const alone = state.own && when !== "before";
+  const key = when === "before" ? when : alone ? `pair ${state.only}` : `${state.model} ${state.mode}`;
   if (views[key]) return views[key];
+  if (alone) for (const old in views) if (old.startsWith("pair")) delete views[old];
   const zero = Array(DATA.dim).fill(0);
-  const used = DATA.scans.map((s) => when === "before" || s.placed);
+  const used = DATA.scans.map((_, i) => isMember(i, when));
   const first = POINTS.map((_, i) => i).filter((i) => used[i]);
   const T = poseOf(first[0], when);
   const middle = DATA.points.offset[first[0]];
@@ -80,12 +99,12 @@ function arranged(when) {
     T === null ? middle[a] : T[a][DATA.dim] + middle.reduce((s, m, b) => s + T[a][b] * m, 0));
   const parts = POINTS.map((_, i) => (used[i] ? coordinates(i, when, origin) : null));
   const box = robustBox(parts.filter((p) => p !== null));
-  views[key] = { parts, box, origin };
+  views[key] = { parts, box, origin, key };
   return views[key];
 }
 
 function isShown(i) {
-  if (state.when === "after" && !DATA.scans[i].placed) return false;
+  if (!isMember(i, state.when)) return false;
   return state.only ? state.only.includes(i) : state.shown[i];
 }
 
@@ -174,7 +193,7 @@ function cameraOn(view) {
 }
 
 // The layout of the main view; `seen` is what the camera starts on.
-function sceneLayout({ box } = arranged(state.when), seen = null) {
+function sceneLayout({ box, key = state.when } = arranged(state.when), seen = null) {
   const base = {
     margin: { l: 0, r: 0, t: 0, b: 0 },
     paper_bgcolor: "rgba(0,0,0,0)",
@@ -185,7 +204,7 @@ function sceneLayout({ box } = arranged(state.when), seen = null) {
     const grow = 0.05 * Math.max(...box.map(([l, h]) => h - l));
     const axis = (a) => ({ visible: false, range: [box[a][0] - grow, box[a][1] + grow] });
     return {
-      ...base, dragmode: "pan", uirevision: state.when,
+      ...base, dragmode: "pan", uirevision: key,
       xaxis: axis(0), yaxis: { ...axis(1), scaleanchor: "x" },
     };
   }
@@ -252,7 +271,9 @@ function scanList() {
       shown[i] = box.checked;
       change({ shown, only: null });
     });
-    const note = scan.placed ? scan.points.toLocaleString("en") : "not placed";
+    const k = scan.component;
+    const points = scan.points.toLocaleString("en");
+    const note = k < 0 ? "not placed" : k > 0 ? `${points}, component ${k}` : points;
     $("list").append(el("label", { class: "row", title: scan.name }, box,
       el("span", { class: "dot", style: `background:${rgb(scan.color)}` }),
       el("span", { class: "name" }, scan.name), el("small", {}, note)));
@@ -290,13 +311,21 @@ function showOnly() {
   box.hidden = !state.only;
   if (!state.only) return;
   const [i, j] = state.only.map((k) => DATA.scans[k].name);
-  box.replaceChildren(`${i} and ${j} alone `,
+  const { joined } = pairOf(state.only);
+  const by = state.own ? "by the motion of the pair " : "by the final poses ";
+  const other = state.own ? "Final poses" : "Motion of the pair";
+  box.replaceChildren(`${i} and ${j} alone, ${by}`, ...(joined ? [
+    el("button", { type: "button", class: "plain", id: "own", onclick: () => change({ own: !state.own }) }, other)] : []),
     el("button", { type: "button", class: "plain", id: "every", onclick: () => change({ only: null }) }, "Show all"));
 }
 
 function startScans() {
   POINTS = readPoints();
   choice("when", [["before", "Before"], ["after", "After"]], "when");
+  if (NUM_MODELS > 1) {
+    const models = Array.from({ length: NUM_MODELS }, (_, k) => [k, `Component ${k}`]);
+    choice("model", models, "model", { only: null, when: "after" });
+  }
   choice("color", [["scan", "By scan"], ["distance", "By distance"]], "color");
   const total = POINTS.reduce((sum, p) => sum + p.n, 0);
   const all = DATA.scans.reduce((sum, s) => sum + s.points - s.dropped, 0);
@@ -309,5 +338,6 @@ function startScans() {
   modeList();
   listeners.push(drawScene, showScale, showOnly);
   showScale();
+  if (!FLAT) chooseCut();
   return Plotly.newPlot("scene", sceneTraces(), sceneLayout(), CONFIG);
 }
