@@ -92,7 +92,7 @@ def write_report(
     pair = len(labels) == 2 and modes is not None
     data = {
         "kind": "scans",
-        "title": _title(labels, pair),
+        "title": _title(labels, pair, result.num_components),
         "dim": clouds[0].shape[1],
         "status": status_entry(result.status),
         "camera": None if camera is None else camera.tolist(),
@@ -125,8 +125,11 @@ def _camera(
     return tilt(20.0, 25.0) @ axes
 
 
-def _title(names: list[str], pair: bool) -> str:
-    return f"{names[1]} onto {names[0]}" if pair else f"{len(names)} scans in one frame"
+def _title(names: list[str], pair: bool, models: int) -> str:
+    if pair:
+        return f"{names[1]} onto {names[0]}"
+    frames = "one frame" if models == 1 else f"{models} frames"
+    return f"{len(names)} scans in {frames}"
 
 
 def _scan_rows(

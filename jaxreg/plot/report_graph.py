@@ -17,7 +17,7 @@ from jaxreg.plot.report_parts import (
     raw,
     status_entry,
 )
-from jaxreg.plot.results import residuals
+from jaxreg.plot.results import MAX_COVARIANCES, residuals
 
 
 _MAX_ROWS = 400
@@ -45,7 +45,8 @@ def write_graph_report(
         solution: what `average` made of them.
         before: poses to compare with; None for those along a spanning tree.
         names: of the frames; their numbers by default.
-        covariances: `(v, k, k)` as `pose_covariances` gives them.
+        covariances: `(v, k, k)`; by default, for some hundred frames, those that
+            `pose_covariances` gives.
         details: as in `write_report`, and `objective_before`, `objective_after`.
 
     Raises:
@@ -65,6 +66,8 @@ def write_graph_report(
     angle, distance = residuals(T, edges, np.asarray(graph.T_i_j)[keep])
     width = np.asarray(solution.kernel_width, np.float64)
     shown = min(len(T), _MAX_ROWS)
+    if covariances is None and len(T) <= MAX_COVARIANCES:
+        covariances = jaxreg.pose_covariances(graph, solution)
     sigma = deviations(covariances, len(T))
     title = f"{len(T):,} poses from {len(edges):,} edges"
     data = {

@@ -11,7 +11,7 @@ from jaxreg._core.status import Status
 from jaxreg.io.result import Result
 
 
-_MAX_UNKNOWNS = 600
+MAX_COVARIANCES = 300  # poses; the matrix of all is dense
 
 
 def result_of(
@@ -86,7 +86,7 @@ def covariances_of(result: Result) -> np.ndarray | None:
     """
     num, D = len(result.names), result.T_world_i.shape[-1]
     k = D * (D - 1) // 2
-    if k * num > _MAX_UNKNOWNS:
+    if num > MAX_COVARIANCES:
         return None
     out = np.full((num, k, k), np.nan)
     for component in range(result.num_components):

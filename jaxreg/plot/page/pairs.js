@@ -25,7 +25,7 @@ function showPair(pair) {
 }
 
 function ring() {
-  const [size, radius, middle] = [480, 178, 240];
+  const [size, radius, middle] = [480, 160, 240];
   const v = DATA.scans.length;
   const place = (i, r) => {
     const angle = (2 * Math.PI * i) / v - Math.PI / 2;
