@@ -1,9 +1,10 @@
 """`compiled`: jit for programs of many small kernels, quicker to compile on CPU.
 
-XLA's newer generator of CPU kernels takes longer over each kernel than the older one:
-with that a first call of `average` takes two thirds of the time, and later ones a
-quarter more. Not for the search of closest points: over long chains of comparisons the
-older generator takes minutes.
+XLA's newer generator of CPU kernels takes longer over each kernel than the older one,
+with which first calls of `register` and `average` take two thirds of the time; later
+ones of `register` take as long, of `average` a quarter longer. The older one takes
+minutes over a chain of `where` in which each condition and each value use the last one:
+write such a chain as a minimum.
 """
 
 import functools

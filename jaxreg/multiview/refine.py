@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxreg._core.arrays import cast_floats
+from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import AbstractAverager, Correntropy, SpanningTree
 from jaxreg.geometry import lie
@@ -70,7 +71,7 @@ def wide_unless_given(averaging: AbstractAverager | None) -> AbstractAverager:
     return averaging
 
 
-@eqx.filter_jit
+@compiled
 def _updated(before: Placement, after: Placement) -> Placement:
     """The later poses of the scans that both hold, in the earlier frames.
 
@@ -90,7 +91,7 @@ def _updated(before: Placement, after: Placement) -> Placement:
     return eqx.tree_at(lambda p: (p.T_world_i, p.part), before, (T, first))
 
 
-@eqx.filter_jit
+@compiled
 def measured(
     scans: PreparedScans, placement: Placement, min_overlap: Scalar, *, exact: bool
 ) -> RelativeMotions:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.multiview.scans import PreparedScans
 from jaxreg.particle import ParticleFilter
@@ -68,7 +69,7 @@ class RelativeMotions(eqx.Module):
         return RelativeMotions(self.pairs, T_i_j, self.overlap, rmse)
 
 
-@eqx.filter_jit
+@compiled
 def relative_motions(
     method: ParticleFilter,
     scans: PreparedScans,

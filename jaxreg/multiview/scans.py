@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.compile import compiled
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motions, Scalar
 from jaxreg.cloud import PointCloud, centroid, median_spacing, rms_radius
@@ -108,7 +109,7 @@ def prepare_scan(
     return cloud, table, mean, median_spacing(cloud.points, cloud.mask)
 
 
-@eqx.filter_jit
+@compiled
 def prepare_scans(
     method: ParticleFilter,
     points: Float[Array, "v n d"],

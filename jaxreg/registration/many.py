@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Hashable
 from typing import TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Array
 from jaxreg._core.checks import (
     is_concrete,
 )
+from jaxreg._core.compile import compiled
 from jaxreg._core.padding import (
     rounded_up,
     stacked,
@@ -161,7 +161,7 @@ def _over_cores(
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
-@eqx.filter_jit
+@compiled
 def _register_rows(
     method: AbstractRegistrar, pairs: _Pairs, impl: Hashable
 ) -> RegistrationSolution:

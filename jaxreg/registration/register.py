@@ -1,6 +1,5 @@
 """`register`: what its users call."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -10,6 +9,7 @@ from jaxreg._core.checks import (
     check_motion,
     check_pair,
 )
+from jaxreg._core.compile import compiled
 from jaxreg._core.padding import (
     check_lists,
     is_list_of_clouds,
@@ -115,7 +115,7 @@ def _check_init(
         ) from err
 
 
-@eqx.filter_jit
+@compiled
 def _register_one(
     method: AbstractRegistrar,
     pair: tuple[Array, ...],

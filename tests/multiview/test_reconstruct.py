@@ -11,6 +11,7 @@ import jaxreg as jr
 from jaxreg import Status
 from jaxreg.datasets import sculpture_scans
 from jaxreg.multiview import RelativeMotions
+from jaxreg.multiview.inputs import padded_scans
 
 
 FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64, max_points=1024)
@@ -241,15 +242,14 @@ def test_scans_in_another_unit_are_left_out(sculpture):
     assert np.sum(sol.placed) >= 5
 
 
-def test_a_scan_of_many_points_is_taken_as_any_other(sculpture):
-    scans, truth = sculpture
-    rng = np.random.default_rng(0)
-    many = scans[1][rng.integers(0, 3000, 2_000_000)]
-    many += 1e-4 * rng.standard_normal(many.shape, np.float32)
-    sol = jr.reconstruct([scans[0], many], key=jax.random.key(0), method=FILTER)
-    angle, shift = pose_error(sol.T_world_i[1], np.linalg.inv(truth[0]) @ truth[1])
-    assert angle < 0.02
-    assert shift < 0.004
+def test_of_a_scan_of_many_points_some_are_drawn():
+    few, many = np.ones((100, 3), np.float32), np.arange(6e6, dtype=np.float32)
+    points, mask = padded_scans([few, many.reshape(-1, 3)], None)
+    assert points.shape == (2, 524_288, 3)
+    np.testing.assert_array_equal(np.sum(mask, axis=1), [100, 524_288])
+    rows = np.asarray(points[1, :, 0]) / 3
+    assert np.all(np.diff(rows) > 0)  # rows of the scan, none twice
+    assert np.ptp(np.histogram(rows, 10, (0, 2e6))[0]) < 2000
 
 
 def test_two_objects_make_two_components(sculpture):
