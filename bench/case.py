@@ -63,6 +63,7 @@ class Case:
         trials: arguments of `solve`.
         judge: accuracy of the answers, one for each trial.
         repeats: timed calls of each method on each trial; five calls at the least.
+        long: whether a call takes up to minutes: three are enough.
         reference: the method that others are compared with in time.
         items: things that a call handles, named `item`, for a rate; 0 for none.
         warm_up: whether trials differ in shape, so that each compiles.
@@ -78,9 +79,11 @@ class Case:
     items: int = 0
     item: str = ""
     warm_up: bool = False
+    long: bool = False
     x: float | None = None
     x_label: str = ""
 
     def __post_init__(self) -> None:
-        if self.repeats * len(self.trials) < 5:
-            raise ValueError(f"{self.name}: fewer than five calls of each method")
+        least = 3 if self.long else 5
+        if self.repeats * len(self.trials) < least:
+            raise ValueError(f"{self.name}: fewer than {least} calls of each method")

@@ -65,7 +65,7 @@ def cases(options: Options) -> Iterator[Case]:
             data=f"{len(mixture.scans)} scans",
             methods=[own_method(_own), peer_method(peer, partial(_theirs, peer))],
             trials=[(mixture.scans, seed) for seed in range(3)],
-            repeats=2,
+            long=True,
             judge=partial(judge, mixture),
             reference=PEER,
         )
