@@ -85,7 +85,15 @@ def rotation_error(
     align: Align = "first",
     mask: Bool[Array, " v"] | None = None,
 ) -> Float[Array, ""]:
-    """e_R of the MCC paper: the mean over the frames in `mask`, in radians."""
+    """e_R of the MCC paper: the mean over the frames in `mask`, in radians.
+
+    >>> import jax.numpy as jnp
+    >>> from jaxreg import metrics
+    >>> T = jnp.stack([jnp.eye(3), jnp.eye(3)])
+    >>> turned = T.at[1, :2, :2].set(jnp.array([[0.0, -1.0], [1.0, 0.0]]))
+    >>> print(f"{metrics.rotation_error(turned, T):.3f}")  # pi / 2 on one of two
+    0.785
+    """
     return _mean(rotation_errors(T_world_i, T_true_i, align, mask), mask)
 
 

@@ -14,16 +14,20 @@ wrong far from it. Which to take:
     near it, clutter or partial overlap      GemanMcClure, Cauchy, Correntropy, Tukey
     the share of the overlap is known        Trimmed
 
+    >>> from jaxreg import robust
+    >>> robust.Huber().weight(jnp.array([0.25, 16.0]), jnp.array(1.0)).tolist()
+    [1.0, 0.25]
+
 Widths of zero and residuals of zero are safe: weights are finite, nothing is NaN.
 """
 
 import abc
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.quantile import masked_quantile
 
 
@@ -31,7 +35,7 @@ Values = Float[Array, "*n"]
 Width = Float[Array, ""]
 
 
-class AbstractKernel(eqx.Module):
+class AbstractKernel(BriefModule):
     """A robust loss of a residual norm, given squared."""
 
     @abc.abstractmethod

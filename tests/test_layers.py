@@ -1,6 +1,8 @@
 """The layout is the architecture: imports point downward."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import jaxreg
@@ -80,6 +82,22 @@ def test_imports_point_downward():
 def test_every_room_has_a_layer():
     rooms = {_room(path) for path in PACKAGE.rglob("*.py")}
     assert rooms == set(LAYERS) | set(EDGES) | FACADE
+
+
+def test_pictures_are_loaded_when_one_is_asked_for():
+    # The one way up, by name, for the methods of solutions.
+    by_name = [
+        path.relative_to(PACKAGE).as_posix()
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if _room(path) in LAYERS and "importlib" in path.read_text()
+    ]
+    assert by_name == ["_core/solution.py"]
+    heavy = "{'matplotlib', 'plotly', 'rich', 'tyro', 'jaxreg.plot'}"
+    code = f"import sys, jaxreg; sys.exit(str(set(sys.modules) & {heavy} or ''))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent
+    )
+    assert done.stderr.strip() == ""
 
 
 def test_jaxlie_lives_behind_one_module():

@@ -9,7 +9,13 @@ import enum
 
 
 class Status(enum.IntEnum):
-    """The outcome of a solve. Compare with `sol.status == Status.CONVERGED`."""
+    """The outcome of a solve. Compare with `sol.status == Status.CONVERGED`.
+
+    >>> import jaxreg as jr
+    >>> print(jr.Status(1).name, "-", jr.Status(1).advice)
+    MAX_STEPS - The steps ran out before the answer stood still. Raise max_steps, or \
+start nearer to the solution.
+    """
 
     CONVERGED = 0
     MAX_STEPS = 1

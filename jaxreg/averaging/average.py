@@ -30,6 +30,15 @@ def average(
     graphs with a leading axis on every array) and `grad`. The answer has the dtype of
     the graph and does not depend on the unit of length.
 
+        >>> import jaxreg as jr
+        >>> east = [[1, 0, 1], [0, 1, 0], [0, 0, 1]]
+        >>> far = [[1, 0, 2.3], [0, 1, 0], [0, 0, 1]]
+        >>> edges = [(0, 1), (1, 2), (0, 2)]
+        >>> graph = jr.PoseGraph.from_edges(edges, [east, east, far])
+        >>> sol = jr.average(graph, jr.MotionAveraging())
+        >>> sol.T_world_i[:, 0, 2].round(2)
+        Array([0. , 1.1, 2.2], dtype=float32)
+
     Args:
         graph: the relative motions, see `PoseGraph.from_edges`.
         method: how to average; None for `Correntropy()`.

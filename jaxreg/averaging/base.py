@@ -2,19 +2,20 @@
 
 import abc
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.solution import Solution
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, StatusArray
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 
 
-class AveragingSolution(eqx.Module):
+class AveragingSolution(Solution):
     """One pose per frame. Arrays only: it passes through jit, vmap and pickling.
 
     Attributes:
@@ -62,7 +63,7 @@ class AveragingSolution(eqx.Module):
         )
 
 
-class AbstractAverager(eqx.Module):
+class AbstractAverager(BriefModule):
     """A method of motion averaging: settings only, frozen.
 
     Methods are called by `jaxreg.average`, which has checked the graph, reduced it to

@@ -28,7 +28,7 @@ from jaxreg.io.g2o import read_g2o, read_g2o_poses, write_g2o
 from jaxreg.io.result import result_folder, versions, write_json
 from jaxreg.io.tum import write_tum
 from jaxreg.metrics import chordal_objective
-from jaxreg.plot import graph_figure, write_graph_report
+from jaxreg.plot import draw_graph, save_figure, write_graph_report
 
 
 METHODS = {
@@ -97,13 +97,13 @@ class Average(Options):
     ) -> None:
         with result_folder(self.out) as staging:
             with session.timed("write"):
-                graph_figure(
-                    staging / "figure.png",
+                figure = draw_graph(
                     np.asarray(graph.edges),
                     np.asarray(before.T_world_i),
                     np.asarray(sol.T_world_i),
                     np.asarray(sol.placed),
                 )
+                save_figure(staging / "figure.png", figure)
                 write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids)
                 placed = np.asarray(sol.placed)
                 write_tum(

@@ -15,7 +15,7 @@ from jaxreg.cli.runtime import Session
 from jaxreg.io.errors import MissingExtraError
 from jaxreg.io.result import Result, result_document, result_folder, write_result
 from jaxreg.metrics import rotation_errors, translation_errors
-from jaxreg.plot import reconstruction_figure, write_report
+from jaxreg.plot import draw_reconstruction, save_figure, write_report
 
 
 def uncentre(
@@ -66,13 +66,10 @@ def write_files(
     """
     with result_folder(session.options.out) as staging:
         with session.timed("write"):
-            reconstruction_figure(
-                staging / "figure.png",
-                scans,
-                result.T_world_i,
-                result.names,
-                result.component,
+            figure = draw_reconstruction(
+                scans, result.T_world_i, result.names, result.component
             )
+            save_figure(staging / "figure.png", figure)
         document = result_document(
             result,
             command=session.command,

@@ -1,14 +1,14 @@
 """`PointCloud`: points with normals and a mask."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Mask, Points
 from jaxreg.cloud.range_image import RangeImage
 
 
-class PointCloud(eqx.Module):
+class PointCloud(BriefModule):
     """Points of which `mask` are valid, with unoriented unit normals.
 
     Attributes:

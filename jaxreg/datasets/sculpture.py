@@ -74,6 +74,11 @@ def sculpture_scans(
     rigid motion, so that nothing can be read from the frames. The same seed gives the
     same scans.
 
+        >>> from jaxreg.datasets import sculpture_scans
+        >>> scans, T_world_i = sculpture_scans(2, points_per_scan=500)
+        >>> len(scans), T_world_i.shape
+        (2, (2, 4, 4))
+
     Args:
         num_views: number of scans.
         seed: of the noise, the viewpoints' jitter and the frames.

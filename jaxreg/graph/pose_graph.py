@@ -60,6 +60,11 @@ class PoseGraph(eqx.Module):
     ) -> "PoseGraph":
         """Checks relative motions and makes a graph of them.
 
+            >>> import jaxreg as jr
+            >>> T_0_1 = [[0, -1, 2], [1, 0, 0], [0, 0, 1]]
+            >>> jr.PoseGraph.from_edges([(0, 1)], [T_0_1])
+            PoseGraph(2 poses in 2D, 1 edges, float32)
+
         Args:
             edges: `(e, 2)` integers, the frames i and j, counted from 0.
             T_i_j: `(e, d+1, d+1)` motions that map frame j into frame i, float32 or

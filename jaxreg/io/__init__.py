@@ -8,6 +8,13 @@ from jaxreg.io.errors import MissingExtraError as MissingExtraError
 from jaxreg.io.g2o import read_g2o as read_g2o
 from jaxreg.io.g2o import read_g2o_poses as read_g2o_poses
 from jaxreg.io.g2o import write_g2o as write_g2o
+from jaxreg.io.interop import from_gtsam as from_gtsam
+from jaxreg.io.interop import from_open3d_graph as from_open3d_graph
+from jaxreg.io.interop import points_of as points_of
+from jaxreg.io.interop import to_gtsam as to_gtsam
+from jaxreg.io.interop import to_open3d as to_open3d
+from jaxreg.io.interop import to_open3d_graph as to_open3d_graph
+from jaxreg.io.interop import to_trimesh as to_trimesh
 from jaxreg.io.kitti import read_kitti as read_kitti
 from jaxreg.io.kitti import write_kitti as write_kitti
 from jaxreg.io.ply import write_ply as write_ply

@@ -6,7 +6,7 @@ class InputError(ValueError):
 
 
 class MissingExtraError(ImportError):
-    """A package of an optional extra, `app` or `formats`, is not installed."""
+    """A package of an optional extra, such as `app`, is not installed."""
 
     def __init__(self, package: str, purpose: str, extra: str = "app"):
         super().__init__(

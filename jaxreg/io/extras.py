@@ -7,8 +7,8 @@ from types import ModuleType
 from jaxreg.io.errors import InputError, MissingExtraError
 
 
-def reader(package: str, kind: str) -> ModuleType:
-    """The package of the extra `formats` that reads files of this kind.
+def reader(package: str, kind: str, extra: str = "formats") -> ModuleType:
+    """The package of an extra that reads files or makes objects of this kind.
 
     Raises:
         MissingExtraError: if it is not installed.
@@ -16,7 +16,7 @@ def reader(package: str, kind: str) -> ModuleType:
     try:
         return importlib.import_module(package)
     except ModuleNotFoundError as err:
-        raise MissingExtraError(package, f"Reading {kind}", extra="formats") from err
+        raise MissingExtraError(package, f"Reading {kind}", extra) from err
 
 
 def unreadable(path: str | Path, kind: str, reason: object) -> InputError:

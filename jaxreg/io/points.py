@@ -47,6 +47,15 @@ class NamedPoints(NamedTuple):
 def read_points(path: str | Path) -> np.ndarray:
     """Reads one point set.
 
+        >>> import numpy as np, pathlib, tempfile
+        >>> from jaxreg import io
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "corner.ply"
+        >>> io.write_ply(path, np.eye(3, dtype=np.float32))
+        >>> io.read_points(path)
+        array([[1., 0., 0.],
+               [0., 1., 0.],
+               [0., 0., 1.]], dtype=float32)
+
     PLY (binary or ASCII, through plyfile), PCD, LAS, LAZ, the vertices of OBJ and STL,
     and text files; all of these may be compressed (`.gz`). Text is separated by commas,
     semicolons or white space, with or without a header line; the first three numeric

@@ -3,20 +3,21 @@
 import abc
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammainc
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.brief import BriefModule
+from jaxreg._core.solution import Solution
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import PointCloud
 from jaxreg.geometry import lie
 
 
-class Modes(eqx.Module):
+class Modes(BriefModule):
     """Distinct poses that the search ended in, best first.
 
     Attributes:
@@ -88,7 +89,7 @@ class Modes(eqx.Module):
         return jnp.any(near & (before < probability) & (self.weight > 0))
 
 
-class RegistrationSolution(eqx.Module):
+class RegistrationSolution(Solution):
     """The pose of a source in the frame of a target, and how far to trust it.
 
     Attributes:
@@ -142,7 +143,7 @@ class RegistrationSolution(eqx.Module):
         return f"RegistrationSolution(batch={np.shape(self.status)})"
 
 
-class AbstractRegistrar(eqx.Module):
+class AbstractRegistrar(BriefModule):
     """A method for `register`.
 
     `solve` works in frames prepared by `register`: both clouds centred at their

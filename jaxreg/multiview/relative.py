@@ -6,13 +6,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.multiview.scans import PreparedScans
 from jaxreg.particle import ParticleFilter
 
 
-class RelativeMotions(eqx.Module):
+class RelativeMotions(BriefModule):
     """What the search found for pairs of scans, scan j on scan i.
 
     Attributes:

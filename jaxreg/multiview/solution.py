@@ -7,13 +7,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.solution import Solution
 from jaxreg._core.status import Status
 from jaxreg._core.typing import StatusArray
 from jaxreg.graph import PoseGraph
 from jaxreg.multiview.relative import RelativeMotions
 
 
-class ReconstructionSolution(eqx.Module):
+class ReconstructionSolution(Solution):
     """One pose per scan, and every pair that was tried.
 
     Attributes:

@@ -21,10 +21,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Mask, Points, Scalar
 
 
-class Neighbours(eqx.Module):
+class Neighbours(BriefModule):
     """The closest target points of each query: `(n,)`, or `(n, k)` for k > 1.
 
     Attributes:
@@ -40,7 +41,7 @@ class Neighbours(eqx.Module):
     valid: Bool[Array, " n *k"]
 
 
-class AbstractIndex(eqx.Module):
+class AbstractIndex(BriefModule):
     """Closest points of one target set."""
 
     points: eqx.AbstractVar[Array]

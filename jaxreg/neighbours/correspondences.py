@@ -24,6 +24,13 @@ def correspondences(
     For the pose of any method, on all the points of one pair (`register` itself works
     on thinned clouds). Batches by `jax.vmap`.
 
+        >>> import jax.numpy as jnp
+        >>> import jaxreg as jr
+        >>> source, target = [[0.0, 0.1]], [[5.0, 5.0], [0.0, 0.0]]
+        >>> found = jr.correspondences(source, target, jnp.eye(3))
+        >>> int(found.index[0])
+        1
+
     Args:
         source: `(n, d)` points.
         target: `(m, d)` points of the same dtype.

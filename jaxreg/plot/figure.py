@@ -18,14 +18,13 @@ _MAX_POINTS = 600_000
 _MAX_MODELS = 4
 
 
-def reconstruction_figure(
-    path: str | Path,
+def draw_reconstruction(
     scans: Sequence[np.ndarray],
     T_world_i: np.ndarray,
     names: Sequence[str],
     component: Sequence[int] | np.ndarray | None = None,
-) -> None:
-    """Draws a PNG: the scans as given, the scans in one frame, and a cross-section.
+) -> Any:
+    """Draws the scans as given, the scans in one frame, and a cross-section.
 
     Each scan has one colour. The cross-section is a thin slab through the middle of the
     model, as in Fig. 1 of the MCC paper: where scans agree, their outlines coincide.
@@ -33,15 +32,16 @@ def reconstruction_figure(
     up to four rows.
 
     Args:
-        path: the PNG file; it appears whole or not at all.
         scans: `(n_i, d)` arrays; rows with NaN or inf are left out.
         T_world_i: `(v, d+1, d+1)` poses.
         names: of the scans, for the legend.
         component: `(v,)` number of each scan's component, -1 for scans without a pose,
             which are left out after "before"; None if all are of one.
 
+    Returns:
+        A `matplotlib.figure.Figure`.
+
     Raises:
-        InputError: if the file cannot be written.
         MissingExtraError: if matplotlib is not installed.
     """
     module = figure_module()
@@ -76,6 +76,15 @@ def reconstruction_figure(
         wspace=0.04,
         hspace=0.1,
     )
+    return figure
+
+
+def save_figure(path: str | Path, figure: Any) -> None:
+    """Writes a figure as a PNG file, which appears whole or not at all.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     with atomic_write(path, "wb") as file:

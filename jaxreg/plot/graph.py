@@ -1,33 +1,27 @@
 """The picture of an averaged pose graph: its edges before and after."""
 
-import io
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxreg.io.atomic import atomic_write
 from jaxreg.plot.figure import figure_module, principal_axes, tilt
 
 
-def graph_figure(
-    path: str | Path,
-    edges: np.ndarray,
-    T_before: np.ndarray,
-    T_after: np.ndarray,
-    placed: np.ndarray,
-) -> None:
-    """Draws a PNG: every edge as a line between positions, before and after.
+def draw_graph(
+    edges: np.ndarray, T_before: np.ndarray, T_after: np.ndarray, placed: np.ndarray
+) -> Any:
+    """Draws every edge as a line between positions, before and after.
 
     Args:
-        path: the PNG file; it appears whole or not at all.
         edges: `(e, 2)` frames i and j.
         T_before: `(v, d+1, d+1)` poses chained along a tree.
         T_after: `(v, d+1, d+1)` poses that were found.
         placed: `(v,)` frames that have a pose; edges to the others are left out.
 
+    Returns:
+        A `matplotlib.figure.Figure`.
+
     Raises:
-        InputError: if the file cannot be written.
         MissingExtraError: if matplotlib is not installed.
     """
     figure = figure_module().Figure(figsize=(10, 5), dpi=130)
@@ -48,10 +42,7 @@ def graph_figure(
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_axis_off()
     figure.subplots_adjust(left=0.02, right=0.98, top=0.92, bottom=0.02, wspace=0.04)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    with atomic_write(path, "wb") as file:
-        file.write(buffer.getvalue())
+    return figure
 
 
 def _positions(T: np.ndarray) -> np.ndarray:

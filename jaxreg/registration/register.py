@@ -36,6 +36,18 @@ def register(
 ) -> RegistrationSolution:
     """Registers a source point set to a target, or many pairs of them.
 
+        >>> import jaxreg as jr
+        >>> target = [[0, 0], [3, 0], [3, 1], [1, 1], [1, 2], [0, 2]]
+        >>> source = [[x - 0.1, y + 0.2] for x, y in target]
+        >>> method = jr.ICP(jr.PointToPoint(), kernel=jr.robust.L2())
+        >>> sol = jr.register(source, target, method)
+        >>> sol.T_target_source[:2, 2].round(3)  # where the origin went
+        Array([ 0.1, -0.2], dtype=float32)
+        >>> jr.Status(int(sol.status)).name
+        'CONVERGED'
+
+    Without an initial guess, by the default method: `register(a, b, key=key)`.
+
     Args:
         source: `(n, d)` points, d = 2 or 3; a batch of pairs `(..., n, d)`; or a list
             of `(n_i, d)` points of any sizes, also none. Arrays are what

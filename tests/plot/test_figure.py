@@ -4,7 +4,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from jaxreg.plot import graph_figure, reconstruction_figure
+from jaxreg.plot import draw_graph, draw_reconstruction, save_figure
 from jaxreg.plot.render import render_points
 
 
@@ -28,7 +28,8 @@ def test_reconstruction_figure_shows_points(tmp_path: Path, d: int):
     T = np.tile(np.eye(d + 1), (3, 1, 1))
     T[2, :d, d] = 100.0
     path = tmp_path / "figure.png"
-    reconstruction_figure(path, scans, T, ["a", "b", "c"], component=[0, 0, -1])
+    figure = draw_reconstruction(scans, T, ["a", "b", "c"], component=[0, 0, -1])
+    save_figure(path, figure)
     image = matplotlib.image.imread(path)
     width = image.shape[1]
     panels = 3 if d == 3 else 2
@@ -42,7 +43,8 @@ def test_every_component_has_a_row(tmp_path: Path, d: int):
     scans = [_sphere(800)[:, :d] for _ in range(4)]
     T = np.tile(np.eye(d + 1), (4, 1, 1))
     path = tmp_path / "figure.png"
-    reconstruction_figure(path, scans, T, list("abcd"), component=[0, 0, 1, 1])
+    figure = draw_reconstruction(scans, T, list("abcd"), component=[0, 0, 1, 1])
+    save_figure(path, figure)
     image = matplotlib.image.imread(path)
     row = image[image.shape[0] // 2 : -90, image.shape[1] // 3 :, :3]
     assert np.mean(np.any(row < 0.95, axis=-1)) > 0.001
@@ -53,8 +55,9 @@ def test_flat_and_tiny_clouds_do_not_break_the_figure(tmp_path: Path):
     plane[:, :2] = RNG.normal(size=(50, 2))
     few = np.eye(4)[:, :3]
     T = np.tile(np.eye(4), (2, 1, 1))
-    reconstruction_figure(tmp_path / "a.png", [plane, plane[:10]], T, ["a", "b"])
-    reconstruction_figure(tmp_path / "b.png", [few, few], T, ["a", "b"])
+    for name, scans in (("a", [plane, plane[:10]]), ("b", [few, few])):
+        figure = draw_reconstruction(scans, T, ["a", "b"])
+        save_figure(tmp_path / f"{name}.png", figure)
     assert _painted(tmp_path / "a.png") > 0.001
     assert _painted(tmp_path / "b.png") > 0.001
 
@@ -67,7 +70,7 @@ def test_graph_figure_shows_edges(tmp_path: Path):
         T[:, d - 1, d] += 0.1 * angle
         edges = np.stack([np.arange(19), np.arange(1, 20)], axis=1)
         path = tmp_path / f"{d}.png"
-        graph_figure(path, edges, T, T, np.ones(20, bool))
+        save_figure(path, draw_graph(edges, T, T, np.ones(20, bool)))
         assert _painted(path) > 0.002
 
 

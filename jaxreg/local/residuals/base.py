@@ -11,13 +11,13 @@ H (v, w) = b.
 import abc
 from typing import ClassVar
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
+from jaxreg._core.brief import BriefModule
 from jaxreg.local.problem import Match
 
 
-class AbstractResidual(eqx.Module):
+class AbstractResidual(BriefModule):
     """What is made small.
 
     Attributes:

@@ -2,18 +2,18 @@
 
 import abc
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Motion
 from jaxreg.geometry import lie
 from jaxreg.local.problem import Match
 from jaxreg.local.residuals import AbstractResidual
 
 
-class AbstractStep(eqx.Module):
+class AbstractStep(BriefModule):
     """One update of the pose with correspondences and weights held."""
 
     @abc.abstractmethod

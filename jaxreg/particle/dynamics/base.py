@@ -2,14 +2,14 @@
 
 import abc
 
-import equinox as eqx
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Key
 from jaxreg.particle.state import Particles
 
 
-class AbstractDynamics(eqx.Module):
+class AbstractDynamics(BriefModule):
     """The prediction p(x_t | x_{t-1}, z_{t-1}) (PF paper, section 3.2)."""
 
     @property

@@ -3,15 +3,15 @@
 import abc
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Scalar
 from jaxreg.local import Match
 
 
-class AbstractEnergy(eqx.Module):
+class AbstractEnergy(BriefModule):
     """E of p(z_t | x_t) = exp(-E / temperature) (PF paper, section 3.3, step 2).
 
     The paper prints the exponent without its minus. Energies are means over the valid

@@ -4,14 +4,14 @@ import abc
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.typing import Key, Motion
 
 
-class AbstractPrior(eqx.Module):
+class AbstractPrior(BriefModule):
     """pi_0: where the particles are at t = 0 (PF paper, section 4.2)."""
 
     @abc.abstractmethod

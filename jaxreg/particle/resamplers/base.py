@@ -6,12 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.typing import Key
 from jaxreg.particle.weights import effective_sample_size
 
 
-class AbstractResampler(eqx.Module):
+class AbstractResampler(BriefModule):
     """Replaces weighted particles by copies (PF paper, section 3.4).
 
     Attributes:
