@@ -44,7 +44,6 @@ def draw_reconstruction(
     Raises:
         MissingExtraError: if matplotlib is not installed.
     """
-    module = figure_module()
     component = np.zeros(len(scans), int) if component is None else component
     component = np.asarray(component)
     stride = 1 + sum(len(s) for s in scans) // _MAX_POINTS
@@ -57,7 +56,7 @@ def draw_reconstruction(
     solid = before[0].shape[1] == 3
     rows = min(int(component.max()) + 1, _MAX_MODELS)
     height = 3.9 * rows + 1
-    figure = module.Figure(figsize=(13 if solid else 10, height), dpi=130)
+    figure = new_figure(figsize=(13 if solid else 10, height), dpi=130)
     axes = figure.subplots(rows, 3 if solid else 2, squeeze=False)
     draw = _draw_solid if solid else _draw_flat
     for k, panels in enumerate(axes):
@@ -85,10 +84,8 @@ def save_figure(path: str | Path, figure: Any) -> None:
     Raises:
         InputError: if the file cannot be written.
     """
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
     with atomic_write(path, "wb") as file:
-        file.write(buffer.getvalue())
+        file.write(_png(figure))
 
 
 def _draw_solid(
@@ -202,8 +199,8 @@ def _legend(
     )
 
 
-def figure_module() -> ModuleType:
-    """Matplotlib's figures, without its global state.
+def new_figure(**settings: Any) -> Any:
+    """A matplotlib figure without global state, which notebooks show as a picture.
 
     Raises:
         MissingExtraError: if matplotlib is not installed.
@@ -212,7 +209,18 @@ def figure_module() -> ModuleType:
         import matplotlib.figure
     except ModuleNotFoundError as err:
         raise MissingExtraError("matplotlib", "Drawing figures") from err
-    return matplotlib.figure
+
+    class Picture(matplotlib.figure.Figure):
+        def _repr_png_(self) -> bytes:
+            return _png(self)
+
+    return Picture(**settings)
+
+
+def _png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
 
 
 def _matplotlib_lines() -> ModuleType:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxreg.plot.figure import figure_module, principal_axes, tilt
+from jaxreg.plot.figure import new_figure, principal_axes, tilt
 
 
 def draw_graph(
@@ -24,7 +24,7 @@ def draw_graph(
     Raises:
         MissingExtraError: if matplotlib is not installed.
     """
-    figure = figure_module().Figure(figsize=(10, 5), dpi=130)
+    figure = new_figure(figsize=(10, 5), dpi=130)
     axes = figure.subplots(1, 2)
     edges = edges[placed[edges].all(axis=1)]
     after = _positions(T_after)

@@ -75,7 +75,9 @@ TREE = jaxreg.average(GRAPH, jaxreg.SpanningTree())
 def test_solutions_draw_themselves(
     tmp_path: Path, solution: jaxreg.RegistrationSolution, data: tuple, panels: int
 ):
-    assert len(solution.plot(*data).axes) == panels
+    picture = solution.plot(*data)
+    assert len(picture.axes) == panels
+    assert picture._repr_png_().startswith(b"\x89PNG")
     solution.to_html(tmp_path / "a.html", *data)
     assert "application/json" in (tmp_path / "a.html").read_text("utf-8")
 
