@@ -1,6 +1,5 @@
 """Relative motions between pairs of scans: batches of the pairwise search."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
