@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg.io.errors import InputError
-from jaxreg.io.points import read_scans, unique_names
+from jaxreg.io.points import point_files, read_named, unique_names
 
 
 # Scans whose extents differ by such a factor are taken to be in different units.
 _OTHER_UNIT = 50.0
+# Registration draws some thousand points of a scan, pictures some hundred thousand.
+_MAX_POINTS = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -23,11 +25,13 @@ class Scans:
         names: unique names.
         points: `(n_i, d)` arrays, rows with NaN or inf included.
         places: file, and key or file name within, for messages.
+        notes: what was left out of them.
     """
 
     names: list[str]
     points: list[np.ndarray]
     places: list[str]
+    notes: tuple[str, ...] = ()
 
     def centred(self) -> tuple[list[np.ndarray], np.ndarray]:
         """Scans moved to their own middles, and these, `(v, d)` float64.
@@ -59,13 +63,24 @@ def load_scans(paths: Sequence[Path]) -> Scans:
     names: list[str] = []
     points: list[np.ndarray] = []
     places: list[str] = []
+    notes: list[str] = []
     for path in paths:
-        found, arrays = read_scans(path)
-        names += found
-        points += arrays
+        found = [
+            item
+            for file in point_files(path)
+            for item in read_named(file, _MAX_POINTS).items()
+        ]
         alone = len(found) == 1 and not path.is_dir()
-        places += [str(path) if alone else f"{path} ({name})" for name in found]
-    scans = Scans(unique_names(names), points, places)
+        for name, scan in found:
+            names.append(name)
+            points.append(scan.points)
+            places.append(str(path) if alone else f"{path} ({name})")
+            if scan.step > 1:
+                notes.append(
+                    f"{places[-1]}: large, one of {scan.step} points is used, "
+                    f"{len(scan.points):,} in all."
+                )
+    scans = Scans(unique_names(names), points, places, tuple(notes))
     _require_two(scans)
     _require_one_dimension(scans)
     _require_one_unit(scans)

@@ -58,6 +58,8 @@ class Multiview(SearchOptions):
             scans = load_scans(self.scans)
             _check_viewpoint(self.viewpoint, scans)
             truth = None if self.truth is None else _read_truth(self.truth, scans)
+        for note in scans.notes:
+            session.console.print(note)
         require_writable(self.out)
         key, method, log = self.key(), self.method(), self._log(session, scans)
         try:

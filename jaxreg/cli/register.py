@@ -36,6 +36,8 @@ class Register(SearchOptions):
                 f"{self.target} and {self.source}: hold {len(scans.names)} scans.\n"
                 "Name one of each (FILE.npz:KEY), or use: jaxreg multiview"
             )
+        for note in scans.notes:
+            session.console.print(note)
         require_writable(self.out)
         key, method = self.key(), self.method()
         with session.progress() as progress, session.timed("run", computes=True):

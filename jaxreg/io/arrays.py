@@ -8,22 +8,34 @@ from pathlib import Path
 import numpy as np
 
 from jaxreg.io.errors import InputError
+from jaxreg.io.thinning import Step, every_row
 
 
-def parse_npy(data: bytes, path: Path) -> np.ndarray:
-    """The points of an NPY file, `(n, d)`; `path` is for messages only.
+def parse_npy(
+    data: bytes | None, path: Path, step: Step = every_row
+) -> tuple[np.ndarray, int]:
+    """The points of an NPY file, `(n, d)`, and the number of rows of the file.
+
+    Args:
+        data: its content; None maps the file into memory.
+        path: of the file, and for messages.
+        step: tells from the number of rows which of them to keep.
 
     Raises:
         InputError: if it holds no `(n, 2)` or `(n, 3)` array of numbers.
     """
     try:
-        array = np.load(io.BytesIO(data), allow_pickle=False)
+        if data is None:
+            array = np.load(path, allow_pickle=False, mmap_mode="r")
+        else:
+            array = np.load(io.BytesIO(data), allow_pickle=False)
     except (ValueError, EOFError, OSError) as err:
         raise InputError(
             f"{path}: not a NumPy file of plain numbers.\n"
             "Save it with numpy.save as one float array of shape (n, 3) or (n, 2)."
         ) from err
-    return as_points(array, str(path))
+    num = array.shape[0] if array.ndim else 0
+    return as_points(array[:: step(max(num, 1))] if num else array, str(path)), num
 
 
 def parse_npz(data: bytes, path: Path) -> dict[str, np.ndarray]:

@@ -1,6 +1,7 @@
 """PLY files, binary and ASCII, through plyfile."""
 
 import io
+import os
 from pathlib import Path
 from types import ModuleType
 
@@ -8,14 +9,24 @@ import numpy as np
 
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError, MissingExtraError
+from jaxreg.io.thinning import Step, every_row
 
 
-def parse_ply(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The vertices of a PLY file; `path` is for messages only.
+def parse_ply(
+    data: bytes | None, path: Path, step: Step = every_row
+) -> tuple[np.ndarray, tuple[str, ...], int]:
+    """The vertices of a PLY file.
+
+    Args:
+        data: its content; None maps the file into memory, so that of a large binary
+            one only the rows that are kept are read into it.
+        path: of the file, and for messages.
+        step: tells from the number of rows which of them to keep.
 
     Returns:
         `(n, d)` float32 unless the file stores float64 coordinates, 2D if the vertices
-        have no property z; the names of the properties of a vertex.
+        have no property z; the names of the properties of a vertex; the number of
+        vertices in the file.
 
     Raises:
         InputError: if the data are no PLY file or hold no vertices.
@@ -23,10 +34,11 @@ def parse_ply(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     """
     plyfile = _plyfile()
     try:
-        vertex = plyfile.PlyData.read(io.BytesIO(data))["vertex"].data
+        file = os.fsdecode(path) if data is None else io.BytesIO(data)
+        vertex = plyfile.PlyData.read(file)["vertex"].data
         fields = tuple(vertex.dtype.names or ())
         names = ("x", "y", "z") if "z" in fields else ("x", "y")
-        columns = [np.asarray(vertex[name]) for name in names]
+        columns = [np.asarray(vertex[name][:: step(len(vertex))]) for name in names]
     except (plyfile.PlyParseError, ValueError, KeyError, EOFError, TypeError) as err:
         raise InputError(
             f"{path}: not a complete PLY file with vertices x, y, z ({_short(err)}).\n"
@@ -36,7 +48,7 @@ def parse_ply(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
         raise InputError(f"{path}: holds no points.\nExport or copy the scan again.")
     wide = any(c.dtype.kind != "f" or c.dtype.itemsize > 4 for c in columns)
     points = np.stack(columns, axis=1).astype(np.float64 if wide else np.float32)
-    return points, fields
+    return points, fields, len(vertex)
 
 
 def write_ply(

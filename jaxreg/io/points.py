@@ -13,11 +13,11 @@ import numpy as np
 from jaxreg.io import arrays, e57, las, meshes, pcd, ply, text
 from jaxreg.io.content import require_suffix
 from jaxreg.io.errors import InputError
+from jaxreg.io.thinning import Step, at_most, some_lines
 
 
 TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
 _PARSERS = {
-    ".ply": ply.parse_ply,
     ".pcd": pcd.parse_pcd,
     ".las": las.parse_las,
     ".laz": las.parse_las,
@@ -25,7 +25,7 @@ _PARSERS = {
     ".stl": meshes.parse_stl,
 }
 ARCHIVES = (".npz", ".e57")
-SUFFIXES = (".npy", *_PARSERS, *ARCHIVES, *TEXT)
+SUFFIXES = (".npy", ".ply", *_PARSERS, *ARCHIVES, *TEXT)
 _NEVER_PACKED = (".npy", *ARCHIVES, "")
 _FORMATS = (
     "PLY, XYZ/CSV/TXT text, PCD, LAS/LAZ, OBJ, STL (each also .gz), E57, NPY, NPZ"
@@ -38,10 +38,12 @@ class NamedPoints(NamedTuple):
     Attributes:
         points: `(n, d)` float32 or float64, rows with NaN or inf included.
         fields: names of the columns or properties of the file, empty if it has none.
+        step: of how many rows of the file one was kept.
     """
 
     points: np.ndarray
     fields: tuple[str, ...] = ()
+    step: int = 1
 
 
 def read_points(path: str | Path) -> np.ndarray:
@@ -111,19 +113,23 @@ def read_scans(
     return unique_names(names), scans
 
 
-def read_named(path: str | Path) -> dict[str, NamedPoints]:
+def read_named(
+    path: str | Path, max_points: int | None = None
+) -> dict[str, NamedPoints]:
     """Reads all scans of one file by name, that of the file if there is but one.
 
     Args:
         path: a file as for `read_points`, an archive with or without `:KEY`.
+        max_points: of scans with more, every so many rows are kept. Of PLY, NPY and
+            text files the others are not even read into memory.
 
     Raises:
         InputError: as `read_points`.
     """
     bare, key = _split_key(path)
     if _suffix(bare) not in ARCHIVES:
-        return {stem(bare): _read_file(bare)}
-    scans = _read_archive(bare)
+        return {stem(bare): _read_file(bare, max_points)}
+    scans = {k: _thinned(x, max_points) for k, x in _read_archive(bare).items()}
     if key is None and len(scans) == 1 and _suffix(bare) == ".e57":
         return {stem(bare): next(iter(scans.values()))}  # scanners name all alike
     if key is not None and key not in scans:
@@ -162,20 +168,45 @@ def stem(path: str | Path) -> str:
     return name[: -len(Path(name).suffix)] if Path(name).suffix else name
 
 
-def _read_file(path: Path) -> NamedPoints:
+def _read_file(path: Path, max_points: int | None) -> NamedPoints:
     suffix = _suffix(path)
     if suffix not in SUFFIXES and path.exists():
         raise InputError(
             f"{path}: unknown kind of file {suffix or '(no suffix)'}.\n"
             f"Wanted {_FORMATS}."
         )
+    packed = path.name.lower().endswith(".gz")
+    if max_points is not None and not packed and suffix in (".ply", ".npy", *TEXT):
+        return _thinned(_read_some(path, suffix, at_most(max_points)), max_points)
     data = _read_bytes(path)
     require_suffix(data, suffix, path)
+    if suffix == ".ply":
+        return _thinned(NamedPoints(*ply.parse_ply(data, path)[:2]), max_points)
     if suffix in _PARSERS:
-        return NamedPoints(*_PARSERS[suffix](data, path))
+        return _thinned(NamedPoints(*_PARSERS[suffix](data, path)), max_points)
     if suffix == ".npy":
-        return NamedPoints(arrays.parse_npy(data, path))
-    return NamedPoints(text.parse_text(data, path), text.columns(data))
+        return NamedPoints(arrays.parse_npy(data, path)[0])
+    found = NamedPoints(text.parse_text(data, path), text.columns(data))
+    return _thinned(found, max_points)
+
+
+def _read_some(path: Path, suffix: str, step: Step) -> NamedPoints:
+    """Of a file that may be larger than the memory."""
+    require_suffix(_read_bytes(path, 16), suffix, path)
+    if suffix == ".ply":
+        points, fields, num = ply.parse_ply(None, path, step)
+        return NamedPoints(points, fields, step(num))
+    if suffix == ".npy":
+        points, num = arrays.parse_npy(None, path, step)
+        return NamedPoints(points, step=step(num))
+    data, lines = some_lines(path)
+    return NamedPoints(text.parse_text(data, path), text.columns(data), lines)
+
+
+def _thinned(scan: NamedPoints, max_points: int | None) -> NamedPoints:
+    step = 1 if max_points is None else at_most(max_points)(len(scan.points))
+    points = scan.points if step == 1 else scan.points[::step].copy()
+    return scan._replace(points=points, step=step * scan.step)
 
 
 def _read_archive(path: Path) -> dict[str, NamedPoints]:

@@ -212,14 +212,14 @@ def new_figure(**settings: Any) -> Any:
 
     class Picture(matplotlib.figure.Figure):
         def _repr_png_(self) -> bytes:
-            return _png(self)
+            return _png(self, dpi=90)
 
     return Picture(**settings)
 
 
-def _png(figure: Any) -> bytes:
+def _png(figure: Any, dpi: int | str = "figure") -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
 
 

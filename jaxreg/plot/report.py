@@ -50,7 +50,8 @@ def write_report(
         scans: `(n_i, d)` arrays in the order of the solution, target first for a
             `RegistrationSolution`; rows with NaN or inf are left out.
         solution: what `register` or `reconstruct` returned, or a `Result`.
-        names: of the scans, any text; those of a `Result` by default, else numbers.
+        names: of the scans, any text; by default those of a `Result`, target and source
+            for a `RegistrationSolution`, else numbers.
         modes: for two scans, other poses of the second: `T_target_source`, `weight`
             and `fitness` as in `Modes`; those of a `RegistrationSolution` by default.
         covariances: `(v, k, k)` of the tangents of the poses, translation first; NaN

@@ -39,9 +39,11 @@ def result_of(
         edges = np.asarray(solution.graph.edges)[keep]
         T_i_j = np.asarray(solution.graph.T_i_j, np.float64)[keep]
         weight = np.asarray(solution.edge_weight)[keep]
-    labels = [f"scan {k}" for k in range(len(poses))] if names is None else list(names)
+    labels = ["target", "source"]
+    if isinstance(solution, jaxreg.ReconstructionSolution):
+        labels = [f"scan {k}" for k in range(len(poses))]
     return Result(
-        names=labels,
+        names=labels if names is None else list(names),
         T_world_i=poses,
         component=component,
         status=status,

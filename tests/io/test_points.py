@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from jaxreg.io import InputError, read_points, read_scans, write_ply
+from jaxreg.io.points import read_named
 from jaxreg.io.text import parse_text
 from tests.helpers import data_dir
 
@@ -202,6 +203,30 @@ def test_missing_file_folder_without_points_and_unnamed_scan(tmp_path: Path):
         read_points(tmp_path / "two.npz")
     with pytest.raises(InputError, match="has no scan side"):
         read_points(f"{tmp_path}/two.npz:side")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npy", ".xyz", ".ply.gz"])
+def test_of_large_scans_every_so_many_points_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+):
+    monkeypatch.setattr("jaxreg.io.thinning._MOST_TEXT", 8_000)
+    points = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
+    path = tmp_path / f"scan{suffix}"
+    if suffix == ".npy":
+        np.save(path, points)
+    elif suffix == ".xyz":
+        np.savetxt(path, points)
+    else:
+        write_ply(tmp_path / "scan.ply", points)
+        packed = gzip.compress((tmp_path / "scan.ply").read_bytes())
+        (tmp_path / "scan.ply.gz").write_bytes(packed)
+    (scan,) = read_named(path, max_points=300).values()
+    assert scan.step >= 4
+    assert 1000 / scan.step - 1 <= len(scan.points) <= 300
+    kept = {row.tobytes() for row in points}
+    assert all(x.astype(np.float32).tobytes() in kept for x in scan.points)
+    (whole,) = read_named(path, max_points=2000).values()
+    assert whole.step == (1 if suffix != ".xyz" else whole.step)
 
 
 def test_write_ply_refuses_wrong_shapes(tmp_path: Path):

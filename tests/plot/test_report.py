@@ -278,7 +278,7 @@ def test_flat_scans_from_a_solution(page: Page, tmp_path: Path):
     write_report(path, [target, source], sol)
     page.open(path)
     assert (
-        page.run("document.getElementById('title').textContent") == "scan 1 onto scan 0"
+        page.run("document.getElementById('title').textContent") == "source onto target"
     )
     assert page.run("document.getElementById('section-card').hidden")
     assert _ink(page, tmp_path / "shot.png") > 0.005
