@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from jaxreg.io.atomic import atomic_write
-from jaxreg.plot.figure import figure_module, principal_axes, tilt
+from jaxreg.plot.figure import new_figure, principal_axes, tilt
 
 
 _PATH, _CLEAN, _FALSE = "#1f4e79", "#c9c9c9", "#d1495b"
@@ -27,7 +27,7 @@ class Panel(NamedTuple):
 def trajectories_figure(path: Path, lines: list[list[Panel]]) -> None:
     """Draws a PNG; the last panel of a line is its reference, gray in the others."""
     num, height = max(len(line) for line in lines), 3.0 * len(lines) + 0.3
-    figure = figure_module().Figure(figsize=(2.7 * num, height), dpi=130)
+    figure = new_figure(figsize=(2.7 * num, height), dpi=130)
     axes = figure.subplots(len(lines), num, squeeze=False)
     for row, line in zip(axes, lines, strict=True):
         turn, centre = _camera(line[-1].T_world_i)

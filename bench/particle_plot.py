@@ -9,7 +9,7 @@ import numpy as np
 
 from bench.particle_data import moved
 from jaxreg.io.atomic import atomic_write
-from jaxreg.plot.figure import figure_module, tilt
+from jaxreg.plot.figure import new_figure, tilt
 
 
 _TARGET, _SOURCE = "#b4bac2", "#c1272d"
@@ -30,7 +30,7 @@ def trial_figure(
     columns = 2 if flat else min(4, len(panels))
     rows = -(-len(panels) // columns)
     size = (11, 2.3 * rows) if flat else (3.2 * columns, 3.4 * rows)
-    figure = figure_module().Figure(figsize=size, dpi=130)
+    figure = new_figure(figsize=size, dpi=130)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     before = _seen(target)
     drawn = [_seen(moved(p.T_target_source, source.astype(float))) for p in panels]

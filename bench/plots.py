@@ -9,7 +9,7 @@ import numpy as np
 
 from bench.records import Row
 from jaxreg.io.atomic import atomic_write
-from jaxreg.plot.figure import figure_module
+from jaxreg.plot.figure import new_figure
 
 
 # Colours that people who confuse red and green tell apart; the first for jaxreg.
@@ -197,7 +197,7 @@ def _figure(path: Path, names: list[str], panel: Callable[[Any, str], None]) -> 
     """A panel for each name and one legend, as a PNG."""
     columns = min(3, len(names))
     lines = -(-len(names) // columns)
-    figure = figure_module().Figure(
+    figure = new_figure(
         figsize=(3.6 * columns + 2.4, 3.1 * lines), dpi=110, layout="constrained"
     )
     axes = figure.subplots(lines, columns, squeeze=False).ravel()
