@@ -34,7 +34,8 @@ def as_float_array(x: object, name: str) -> Array:
         except ValueError as err:
             raise ValueError(f"{name}: not a rectangular array of numbers.") from err
         if x.dtype == object or x.dtype.kind in "SUV":
-            raise TypeError(f"{name}: wanted numbers, found dtype {x.dtype}.")
+            hint = "" if x.dtype == object else " Files are read by jaxreg.io."
+            raise TypeError(f"{name}: wanted numbers, found dtype {x.dtype}.{hint}")
         if x.dtype == np.float64 and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
             x = x.astype(np.float32)
     # Of NumPy arrays `jnp.asarray` compiles a program for each size.

@@ -27,6 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments = arguments or ["--help"]
     if arguments in (["--version"], ["-V"]):
         sys.stdout.write(f"jaxreg {version('jaxreg')}\n")
         return 0

@@ -177,7 +177,12 @@ def _parse(path: Path) -> _File:
         opened = gzip.open(path, "rt") if path.suffix == ".gz" else open(path)
         with opened as stream:
             lines = stream.read().splitlines()
-    except (OSError, EOFError, UnicodeDecodeError) as err:
+    except UnicodeDecodeError as err:
+        raise InputError(
+            f"{path}: not a text file, as g2o files are.\n"
+            "Give a pose graph; scans go to: jaxreg multiview"
+        ) from err
+    except (OSError, EOFError) as err:
         reason = getattr(err, "strerror", None) or err
         raise InputError(f"{path}: cannot be read ({reason}).") from err
     found: dict[str, list[tuple[int, list[str]]]] = collections.defaultdict(list)

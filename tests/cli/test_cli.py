@@ -18,7 +18,7 @@ import pytest
 import jaxreg
 from jaxreg import Status
 from jaxreg.cli.main import main
-from jaxreg.io import MissingExtraError, read_points, read_tum
+from jaxreg.io import MissingExtraError, read_points, read_tum, write_ply
 
 
 RNG = np.random.default_rng(0)
@@ -362,6 +362,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
     (folder / "empty.xyz").write_text("")
     (folder / "broken.ply").write_text("ply\nnothing more\n")
     (folder / "occupied").write_text("a file")
+    write_ply(folder / "scan.ply", CLOUD)
     np.save(folder / "few.npy", np.repeat(CLOUD[:3], 9, axis=0))
     np.save(folder / "nan.npy", np.where(np.arange(40)[:, None] < 3, CLOUD, np.nan))
     np.save(folder / "flat.npy", CLOUD[:, :2])
@@ -397,11 +398,12 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "register missing": ([r, "s0.npy", "none.ply"], "none.ply"),
         "register many": ([r, "three.npz", "s0.npy"], "three.npz"),
         "graph missing": ([a, "none.g2o"], "none.g2o"),
+        "graph of scans": ([a, "scan.ply"], "scan.ply: not a text file, as g2o files"),
         "graph cut off": ([a, "bad.g2o"], "bad.g2o, line 1"),
     }
 
 
-@pytest.mark.parametrize("kind", range(24))
+@pytest.mark.parametrize("kind", range(25))
 def test_bad_input_is_named_in_two_lines_with_exit_code_2(
     folder: Path, capsys: pytest.CaptureFixture[str], kind: int
 ):
@@ -518,6 +520,26 @@ def test_help_tells_the_default_of_every_option(
     options = re.findall(r" (--[a-z]+)(?= )(?:(?! --[a-z]).)*", text.split("exit")[1])
     assert "--json" in options
     assert len(options) == text.split("exit")[1].count("(default: ")
+
+
+def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as caught:
+        main([])
+    assert caught.value.code == 0
+    assert "multiview" in capsys.readouterr().out
+
+
+def test_large_scans_are_thinned_and_it_is_said(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = _save_scans(folder)
+    np.save(folder / "s1.npy", np.repeat(_seen_from(POSES[1]), 3, axis=0))
+    monkeypatch.setattr("jaxreg.cli.inputs._MAX_POINTS", 50)
+    given = _fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans]) == 0
+    said = capsys.readouterr().out
+    assert "s1.npy: large, one of 3 points is used, 40 in all." in said
+    assert [len(scan) for scan in given[0][0]] == [40, 40, 40]
 
 
 def test_version(capsys: pytest.CaptureFixture[str]):
