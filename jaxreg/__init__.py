@@ -53,6 +53,10 @@ Static and traced:
 from jaxreg import io as io
 from jaxreg import metrics as metrics
 from jaxreg import robust as robust
+from jaxreg._core.adjoint import ImplicitAdjoint as ImplicitAdjoint
+from jaxreg._core.adjoint import (
+    RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
+)
 from jaxreg._core.status import Status as Status
 from jaxreg.averaging import AveragingSolution as AveragingSolution
 from jaxreg.averaging import Correntropy as Correntropy

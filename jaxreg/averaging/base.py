@@ -98,6 +98,14 @@ def length_scale(graph: PoseGraph) -> Float[Array, ""]:
     return jnp.where(mean > 0, mean, 1)
 
 
+def num_held(graph: PoseGraph) -> Float[Array, ""]:
+    """The number of frames that edges hold, at least one; padding is not held."""
+    w = graph.weight
+    held = jnp.zeros((graph.num_poses,), w.dtype)
+    held = held.at[graph.edges[:, 0]].max(w).at[graph.edges[:, 1]].max(w)
+    return jnp.maximum(jnp.sum(held > 0, dtype=w.dtype), 1)
+
+
 def masked_quantile(
     x: Float[Array, " e"], mask: Bool[Array, " e"], q: float | Array
 ) -> Float[Array, ""]:

@@ -29,13 +29,19 @@ from jaxreg.averaging.gauss_newton import gauss_newton_gradients, gauss_newton_s
 from jaxreg.averaging.graduated import graduated
 from jaxreg.averaging.iterate import (
     Iterated,
+    WidthOf,
     averaging_gradients,
     averaging_step,
     iterate,
 )
 from jaxreg.averaging.laplacian import DENSE_LIMIT
 from jaxreg.averaging.plain import RowsOf, check_rows, iterate_plain, scaled_rows
-from jaxreg.averaging.scales import annealed_width, first_width, gaussian_trust
+from jaxreg.averaging.scales import (
+    annealed_width,
+    first_width,
+    followed_width,
+    gaussian_trust,
+)
 from jaxreg.averaging.support import without_lone_closures
 from jaxreg.averaging.tree import along_frames, start
 from jaxreg.graph.pose_graph import PoseGraph
@@ -75,7 +81,10 @@ class Correntropy(AbstractAverager):
     change the answer.
 
     Gradients: implicit at the fixed point with respect to `T_i_j`, `weight` and
-    `information`; kernel widths, length scale and start are cut.
+    `information`; length scale and start are cut. The widths of "paper" are followed,
+    with respect to `alpha`, too. Those of "annealed" are if they have settled; widths
+    that would grow, but may not, and those of graphs above `DENSE_LIMIT` frames, are
+    held, and then the derivative is that at held widths.
     """
 
     width: Literal["annealed", "paper"] = eqx.field(static=True, default="annealed")
@@ -123,24 +132,30 @@ class Correntropy(AbstractAverager):
         scale = length_scale(graph)
         root_two = jnp.sqrt(jnp.asarray(2, scale.dtype))
 
-        def adaptive(g: PoseGraph, T: Array, _: Array) -> Array:
-            e = weighted_mean(frobenius(g, T, scale), g.weight)
-            sigma = self.alpha * jnp.maximum(e, 64 * jnp.finfo(e.dtype).eps)
-            # The Frobenius norm of a small rotation is sqrt(2) times its angle.
-            return jnp.stack([sigma * scale, sigma / root_two])
+        def adaptive(alpha: Array | float) -> WidthOf:
+            def width_of(g: PoseGraph, T: Array, _: Array) -> Array:
+                e = weighted_mean(frobenius(g, T, scale), g.weight)
+                sigma = alpha * jnp.maximum(e, 64 * jnp.finfo(e.dtype).eps)
+                # The Frobenius norm of a small rotation is sqrt(2) times its angle.
+                return jnp.stack([sigma * scale, sigma / root_two])
+
+            return width_of
+
+        def followed(g: PoseGraph, T: Array, width: Array) -> Array:
+            return gaussian_trust(g, T, adaptive(self.alpha)(g, T, width))
 
         rows = scaled_rows(self.rows)
         end = iterate(
             graph,
             T_start,
             jnp.full((2,), jnp.inf, scale.dtype),
-            adaptive,
+            adaptive(jax.lax.stop_gradient(self.alpha)),
             gaussian_trust,
             averaging_step(rows),
             max_steps=self.max_steps,
             tolerance=self.tolerance,
         )
-        return averaging_gradients(graph, end, gaussian_trust, rows)
+        return averaging_gradients(graph, end, followed, rows)
 
     def _annealed(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"], compare: bool
@@ -148,11 +163,15 @@ class Correntropy(AbstractAverager):
         """Ends from a wide kernel or, where more coherent, from a narrow one."""
         fixed, T_start = jax.lax.stop_gradient((graph, T_start))
         scale = length_scale(fixed)
+
+        def followed(g: PoseGraph, T: Array, width: Array) -> Array:
+            return followed_width((g, T, width, scale))
+
         T_wide = _better_start(fixed, T_start, scaled_rows(self.rows), fixed)
         width = first_width(fixed, T_wide)
         if not compare:
             end = self._from_width(fixed, T_wide, width)
-            return gauss_newton_gradients(graph, end, gaussian_trust)
+            return gauss_newton_gradients(graph, end, gaussian_trust, followed)
         narrow = jnp.minimum(width, _NARROW * jnp.stack([scale, jnp.ones_like(scale)]))
         doubt = (width[1] > _NARROW) | jnp.any(T_wide != T_start)
 
@@ -181,7 +200,7 @@ class Correntropy(AbstractAverager):
         low = jnp.asarray(-jnp.inf, width.dtype)
         start = (jnp.asarray(0, jnp.int32), none, low)
         end = jax.lax.while_loop(unfinished, tried, start)[1]
-        return gauss_newton_gradients(graph, end, gaussian_trust)
+        return gauss_newton_gradients(graph, end, gaussian_trust, followed)
 
     def _from_width(self, graph: PoseGraph, T_start: Array, width: Array) -> Iterated:
         scale = length_scale(graph)

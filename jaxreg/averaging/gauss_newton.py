@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg.averaging.implicit import differentiable
-from jaxreg.averaging.iterate import Iterated, TrustOf
+from jaxreg.averaging.iterate import Iterated, TrustOf, WidthOf
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 
@@ -111,17 +111,24 @@ def gauss_newton_step(
 
 
 def gauss_newton_gradients(
-    graph: PoseGraph, end: Iterated, trust_of: TrustOf
+    graph: PoseGraph,
+    end: Iterated,
+    trust_of: TrustOf,
+    width_of: WidthOf = lambda g, T, width: width,
 ) -> Iterated:
-    """The same result with derivatives by the balance of forces at the minimum."""
+    """The same result with derivatives by the balance of forces at the minimum.
+
+    `width_of` gives the width of the end the derivatives that it is to have.
+    """
     held = jax.lax.stop_gradient(graph.weight * end.trust)
     top = jnp.max(held)
     held = held / jnp.where(top > 0, top, 1)
 
     def imbalance(g: PoseGraph, T: Array) -> Array:
-        trust = trust_of(g, T, end.width)
-        W = precisions(g, trust, end.width)
+        width = width_of(g, T, end.width)
+        W = precisions(g, trust_of(g, T, width), width)
         return forces(g, T, W)
 
     T = differentiable(graph, end.T_world_i, imbalance, held)
-    return end._replace(T_world_i=T, trust=trust_of(graph, T, end.width))
+    width = width_of(graph, T, end.width)
+    return end._replace(T_world_i=T, trust=trust_of(graph, T, width), width=width)

@@ -23,6 +23,7 @@ def differentiable(
     T_world_i: Float[Array, "v D D"],
     imbalance: Callable[[PoseGraph, Array], Array],
     weight: Float[Array, " e"],
+    precondition: Callable[[Array], Array] | None = None,
 ) -> Float[Array, "v D D"]:
     """The same poses, with derivatives with respect to the values of the graph.
 
@@ -32,6 +33,8 @@ def differentiable(
         imbalance: `(v, k)` at given poses, 0 at the fixed point; its derivative with
             respect to left tangents of the poses is near to minus the Laplacian.
         weight: `(e,)` Laplacian weights of at most 1; frames without any are held.
+        precondition: maps `(v, k)` by about the inverse of that derivative, for graphs
+            that are too large for a dense matrix; by default the inverse Laplacian.
     """
     fixed, weight = jax.lax.stop_gradient((T_world_i, weight))
     num, k = fixed.shape[0], lie.tangent_dim(graph.dim)
@@ -47,7 +50,9 @@ def differentiable(
         return jnp.where(free, balance, tangent).reshape(-1)
 
     small = num * k <= _DENSE_UNKNOWNS
-    solver = _dense if small else _krylov(graph.edges, weight, k)
+    if precondition is None:
+        precondition = _inverse_laplacian(graph.edges, weight)
+    solver = _dense if small else _krylov(precondition, k)
 
     def tangent_solve(linear: Callable[[Array], Array], y: Array) -> Array:
         return jax.lax.custom_linear_solve(linear, y, solver, solver)
@@ -69,15 +74,19 @@ def _dense(linear: Callable[[Array], Array], y: Array) -> Array:
     return jnp.linalg.solve(columns.T, y)
 
 
-def _krylov(edges: Array, weight: Array, k: int) -> _Solver:
+def _inverse_laplacian(edges: Array, weight: Array) -> Callable[[Array], Array]:
+    return lambda rows: solve_laplacian(edges, weight, -rows)
+
+
+def _krylov(precondition: Callable[[Array], Array], k: int) -> _Solver:
     def solve(linear: Callable[[Array], Array], y: Array) -> Array:
-        def precondition(r: Array) -> Array:
+        def held(r: Array) -> Array:
             rows = r.reshape(-1, k)
-            return solve_laplacian(edges, weight, -rows).at[0].set(rows[0]).reshape(-1)
+            return precondition(rows).at[0].set(rows[0]).reshape(-1)
 
         tolerance = 100 * float(jnp.finfo(y.dtype).eps)
         return jax.scipy.sparse.linalg.gmres(
-            linear, y, tol=tolerance, restart=20, maxiter=10, M=precondition
+            linear, y, tol=tolerance, restart=20, maxiter=10, M=held
         )[0]
 
     return solve

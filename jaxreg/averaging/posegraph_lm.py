@@ -28,7 +28,9 @@ from jaxreg.averaging.base import (
     solution,
 )
 from jaxreg.averaging.block_system import solve_block_flow
+from jaxreg.averaging.implicit import differentiable
 from jaxreg.averaging.iterate import nearby_rotation
+from jaxreg.averaging.laplacian import divergence
 from jaxreg.averaging.multigrid import Multigrid, anchored, matmul, multigrid
 from jaxreg.averaging.plain import MotionAveraging
 from jaxreg.averaging.tree import start
@@ -68,7 +70,8 @@ class PoseGraphLM(AbstractAverager):
     The length unit matters without information, as an error of one radian counts as
     one of a unit length. `edge_weight` is the kernel's.
 
-    Gradients: none (cut); differentiate `Correntropy` or `MotionAveraging`.
+    Gradients: implicit at the minimum with respect to `T_i_j`, `weight`, `information`
+    and `kernel_width`; the start is cut.
 
     Reference: Kuemmerle, Grisetti et al. 2011 (g2o); Rosen et al. 2019 (SE-Sync).
     """
@@ -94,17 +97,39 @@ class PoseGraphLM(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Minimises the objective of a prepared graph."""
-        graph, self = jax.lax.stop_gradient((graph, self))
-        T_start = jax.lax.stop_gradient(start(self.initialiser, graph, init, key))
+        fixed, held = jax.lax.stop_gradient((graph, self))
+        T_start = jax.lax.stop_gradient(start(self.initialiser, fixed, init, key))
+        problem = held._problem(fixed)
+        end = minimise(problem, T_start, self.max_steps, held.tolerance)
+        T = self._with_gradients(graph, problem, end.T)
         problem = self._problem(graph)
-        end = minimise(problem, T_start, self.max_steps, self.tolerance)
         return solution(
             graph,
-            end.T,
-            edge_weight=problem.trust(problem.squares(end.T)),
+            T,
+            edge_weight=problem.trust(problem.squares(T)),
             converged=end.converged,
             num_steps=end.step,
         )
+
+    def _with_gradients(
+        self, graph: PoseGraph, problem: "Problem", T: Float[Array, "v D D"]
+    ) -> Float[Array, "v D D"]:
+        """The same poses, with derivatives by the balance of forces at the minimum."""
+        Q, num = problem.normal(T)[0], graph.num_poses
+        stiffness = jnp.trace(Q, axis1=-2, axis2=-1)
+        top = jnp.max(stiffness)
+
+        def imbalance(g: PoseGraph, T: Array) -> Array:
+            return -divergence(g.edges, self._problem(g).normal(T)[1], num)
+
+        def precondition(rows: Array) -> Array:
+            # What arrives at pose 0 leaves the others.
+            rows = rows.at[0].set(-jnp.sum(rows[1:], axis=0))
+            x = multigrid(anchored(graph.edges, Q, num))(-rows[..., None])[..., 0]
+            return x - x[0]
+
+        weight = stiffness / jnp.where(top > 0, top, 1)
+        return differentiable(graph, T, imbalance, weight, precondition)
 
     def _problem(self, graph: PoseGraph) -> "Problem":
         if self.objective == "chordal":

@@ -1,9 +1,11 @@
 """Kernel widths that follow the data: rotation and translation at their own scales."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.base import length_scale, masked_quantile
+from jaxreg.averaging.base import length_scale, masked_quantile, num_held
 from jaxreg.averaging.evidence import SCALES, redundancies
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -16,6 +18,8 @@ _INSIDE = 0.05
 #: Medians of chi-squared laws by their degrees of freedom.
 CHI2_MEDIAN = {1: 0.4549, 2: 1.3863, 3: 2.3660, 6: 5.3481}
 _NARROWEST_STEP = 0.25
+# A width that changes by less than this share has settled.
+_SETTLED = 1e-3
 
 
 def gaussian_trust(
@@ -56,6 +60,39 @@ def annealed_width(
     the poses take up.
     `scale` is the `length_scale` of the graph.
     """
+    target = _three_deviations(graph, T_world_i, width, scale)
+    return jnp.clip(target, _NARROWEST_STEP * width, width)
+
+
+@eqx.filter_custom_jvp
+def followed_width(
+    at: tuple[PoseGraph, Float[Array, "v D D"], Float[Array, "2"], Float[Array, ""]],
+) -> Float[Array, "2"]:
+    """The width of arguments of `annealed_width`, with derivatives if it has settled.
+
+    Then it is three deviations of the edges inside itself, and follows motions, weights
+    and poses by that equation; a width that would grow, but may not, is held.
+    """
+    return at[2]
+
+
+@followed_width.def_jvp
+def _followed_width_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    graph, T_world_i, width, scale = primals[0]
+    moved = (*tangents[0][:2], None, None)
+    target, change = eqx.filter_jvp(
+        lambda g, T, w, s: _three_deviations(g, T, w, s), primals[0], moved
+    )
+    by_width = jax.jacfwd(lambda w: _three_deviations(graph, T_world_i, w, scale))
+    settled = jnp.abs(target - width) < _SETTLED * width
+    slope = jnp.where(settled[:, None], by_width(width), 0)
+    change = jnp.where(settled, change, 0)
+    return width, jnp.linalg.solve(jnp.eye(2, dtype=slope.dtype) - slope, change)
+
+
+def _three_deviations(
+    graph: PoseGraph, T_world_i: Array, width: Array, scale: Array
+) -> Float[Array, "2"]:
     d = graph.dim
     rotation, translation = graph.differences(T_world_i)
     trust = gaussian_trust(graph, T_world_i, width)
@@ -66,7 +103,7 @@ def annealed_width(
     v = v / total
     ratio = jnp.minimum(v / width**2, 0.9)
     count = jnp.sum(jnp.where(graph.weight > 0, trust, 0))
-    spare = jnp.maximum(count - (graph.num_poses - 1), 0.25 * count)
+    spare = jnp.maximum(count - (num_held(graph) - 1), 0.25 * count)
     variance = ratio / (1 - ratio) * width**2
     # Noise of many scales would draw the mean to the finest; the median stands.
     inside = (graph.weight > 0) & (trust > _INSIDE)
@@ -78,5 +115,5 @@ def annealed_width(
     )
     variance = jnp.maximum(variance, middle) * count / jnp.maximum(spare, 1e-3)
     floor = 64 * jnp.finfo(w.dtype).eps * jnp.stack([scale, jnp.ones_like(total)])
-    target = jnp.maximum(_DEVIATIONS * jnp.sqrt(variance), floor)
-    return jnp.clip(target, _NARROWEST_STEP * width, width)
+    # In this order: the root has no derivative where the edges agree exactly.
+    return _DEVIATIONS * jnp.sqrt(jnp.maximum(variance, (floor / _DEVIATIONS) ** 2))

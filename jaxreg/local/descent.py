@@ -6,11 +6,12 @@ quickest look-up that the index has (a table); then all points by the index itse
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.adjoint import AbstractAdjoint
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
+from jaxreg.geometry.kabsch import nearest_rotation
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.problem import Match, Problem, match
 from jaxreg.local.scale import fit_scale
@@ -90,8 +91,9 @@ def descend(
     init: Motion,
     scale: Scalar,
     limits: Limits,
+    adjoint: AbstractAdjoint,
 ) -> Descent:
-    """Descends from a pose and a scale; nothing is differentiated."""
+    """Descends from a pose and a scale; `adjoint` is that of the loop."""
     n = problem.source.shape[1]
     step = limits.stride(n)
     coarse = problem.every(step).padded(n)
@@ -112,7 +114,7 @@ def descend(
         if limits.with_scale:
             growth, scaled = fit_scale(optimiser.residual, found, weight)
         T = optimiser.step(state.T, scaled, weight, optimiser.residual)
-        T = lie.orthonormalise(T)
+        T = lie.compose(nearest_rotation(lie.rotation(T)), lie.translation(T))
         change = jnp.max(jnp.abs(decoupled_error(T, state.T)))
         change = jnp.maximum(change, jnp.abs(growth - 1))
         first = state.num_steps == 0
@@ -134,10 +136,11 @@ def descend(
             | (state.num_steps + 2 >= limits.max_steps),
         )
 
-    return lax.while_loop(
+    return adjoint.while_loop(
         lambda s: s.moving & (s.num_steps < limits.max_steps),
         body,
         _before(init, scale, n, fine=step == 1),
+        limits.max_steps,
     )
 
 

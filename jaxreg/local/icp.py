@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core.adjoint import AbstractAdjoint, ImplicitAdjoint
 from jaxreg._core.arrays import cast_floats, traced
 from jaxreg._core.padding import spread_rows
 from jaxreg._core.status import Status
@@ -26,12 +27,12 @@ from jaxreg.geometry import lie
 from jaxreg.local.base import AbstractRegistrar, Modes, RegistrationSolution
 from jaxreg.local.curvature import Curvature, is_degenerate
 from jaxreg.local.descent import Descent, Limits, descend
+from jaxreg.local.implicit import stationary
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.problem import Match, Problem, match
 from jaxreg.local.residuals import AbstractResidual, PlaneToPlane
-from jaxreg.local.scale import fit_scale
 from jaxreg.local.score import Score, mutual_overlap, score, score_match
-from jaxreg.local.steps import AbstractStep, GaussNewton, GradientDescent
+from jaxreg.local.steps import AbstractStep, GaussNewton
 from jaxreg.neighbours import AbstractIndex, BruteForce, index_within
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
@@ -64,15 +65,19 @@ class ICP(AbstractRegistrar):
             `T_target_source` is a rotation times that factor, without a guess it
             starts from the ratio of the clouds' radii, and H, b and the covariance
             are those of the pose at that factor.
+        adjoint: `ImplicitAdjoint()`, or `RecursiveCheckpointAdjoint()` for few steps
+            taken on purpose.
 
     Fails: TOO_FEW_POINTS, NON_FINITE, MAX_STEPS; LOW_OVERLAP where nothing agrees;
     DEGENERATE where the matched surfaces leave a direction free (it is left as in the
     guess); DIVERGED where the end fits worse than the guess, which is returned
     (the scores are those of the end).
 
-    Gradients: with respect to both clouds at the solution, correspondences, kernel
-    weights and normals held (the derivative of one step there, which is that of the
-    fixed point up to the curvature of the residual). Nothing flows to `init`.
+    Gradients: with respect to both clouds and `width_end`, exact by the implicit
+    function theorem where the loop has converged, in forward and reverse mode;
+    correspondences, normals, the sample spacing, and a width that follows the residuals
+    are held, directions that are free do not move, and nothing flows to `init`. With
+    `RecursiveCheckpointAdjoint()` through the steps, also to `init`, in reverse mode.
     """
 
     # Discs ten times thicker than GICP's reach the solution from farther away, with
@@ -87,6 +92,7 @@ class ICP(AbstractRegistrar):
     width_end: Array | float = traced(1.0)
     tolerance: Array | float = traced(1e-4)
     with_scale: bool = eqx.field(default=False, static=True)
+    adjoint: AbstractAdjoint = ImplicitAdjoint()
 
     def __check_init__(self) -> None:
         """Refuses counts that leave nothing to do."""
@@ -119,18 +125,20 @@ class ICP(AbstractRegistrar):
         spacing = median_spacing(target.points, target.mask)
         problem = Problem.of(source, target, self._indexed(target, spacing))
         limits = self._limits(spacing)
-        frozen, init, start_scale = lax.stop_gradient((problem, init, start_scale))
-        end = descend(self._optimiser, frozen, init, start_scale, limits)
+        optimiser = self._optimiser
+        begin = self.adjoint.inputs((optimiser, problem, init, start_scale, limits))
+        end = descend(*begin, self.adjoint)
+        init, start_scale = begin[2:4]
+        T, scale = end.T, end.scale
+        width = jnp.where(end.width == begin[4].floor, limits.floor, end.width)
+        if isinstance(self.adjoint, ImplicitAdjoint):
+            T, scale = stationary(optimiser, problem, width, limits, end)
 
-        scale = end.scale_matched
-        found = match(problem.scaled(scale), end.T_matched, end.row)
+        found = match(problem.scaled(end.scale), end.T_matched, end.row)
         found = limits.within_reach(found)
-        weight = lax.stop_gradient(self._optimiser.weights(found, end.width))
-        if self.with_scale:
-            growth, found = fit_scale(self.residual, found, weight)
-            scale = scale * growth
-        T = self._last_step(end.T_matched, found, weight)
-        worse = self._worse_than(end, frozen, lax.stop_gradient(found), limits)
+        frozen, frozen_found = lax.stop_gradient((problem, found))
+        weight = lax.stop_gradient(optimiser.weights(frozen_found, end.width))
+        worse = self._worse_than(lax.stop_gradient(end), frozen, frozen_found, limits)
         T = jnp.where(worse, init, T)
         scale = jnp.where(worse, start_scale, scale)
 
@@ -142,14 +150,14 @@ class ICP(AbstractRegistrar):
             source, target, lax.stop_gradient(T), scale, spacing
         )
         status = jnp.where(end.moving, Status.MAX_STEPS, Status.CONVERGED)
-        degenerate = is_degenerate(self.residual, found, weight)
+        degenerate = is_degenerate(self.residual, frozen_found, weight)
         status = jnp.where(degenerate, Status.DEGENERATE, status)
         status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
         status = jnp.where(worse, Status.DIVERGED, status)
         T = lie.compose(scale * lie.rotation(T), lie.translation(T))
         status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
         curvature = Curvature.of(
-            self._optimiser, problem.scaled(scale), end.T_matched, found, end.width
+            optimiser, problem.scaled(scale), end.T_matched, found, end.width
         )
         return RegistrationSolution(
             T_target_source=T,
@@ -202,16 +210,6 @@ class ICP(AbstractRegistrar):
         scale = jnp.sqrt(jnp.sum(block * block) / d)
         scale = jnp.where(scale > 0, scale, one)
         return lie.compose(block / scale, lie.translation(init)), scale
-
-    def _last_step(
-        self, T: Motion, found: Match, weight: Float[Array, " n"]
-    ) -> Float[Array, "D D"]:
-        """One step that carries the gradient: correspondences and weights held."""
-        step = self.step
-        # A step of gradient descent is not the solution: its derivative is not either.
-        if isinstance(step, GradientDescent):
-            step = cast_floats(GaussNewton(), weight.dtype)
-        return step(T, found, weight, self.residual)
 
     def _worse_than(
         self, end: Descent, problem: Problem, found: Match, limits: Limits

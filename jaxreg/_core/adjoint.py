@@ -1,0 +1,85 @@
+"""How derivatives pass a loop: the names are those of optimistix and diffrax."""
+
+import abc
+from collections.abc import Callable
+from typing import TypeVar
+
+import equinox as eqx
+import equinox.internal as eqxi
+from jax import lax
+from jaxtyping import Array
+
+
+State = TypeVar("State")
+Tree = TypeVar("Tree")
+
+
+class AbstractAdjoint(eqx.Module):
+    """How a method is differentiated; the answer itself is the same."""
+
+    @abc.abstractmethod
+    def inputs(self, tree: Tree) -> Tree:
+        """What the loop depends on, with the derivatives that it is to see."""
+
+    @abc.abstractmethod
+    def while_loop(
+        self,
+        unfinished: Callable[[State], Array],
+        body: Callable[[State], State],
+        start: State,
+        max_steps: int,
+    ) -> State:
+        """Repeats `body` while `unfinished`, `max_steps` times at most."""
+
+
+class ImplicitAdjoint(AbstractAdjoint):
+    """By the implicit function theorem at the end of the loop, not through its steps.
+
+    Right where the loop has converged. Time and memory do not depend on the number of
+    steps; forward and reverse mode.
+    """
+
+    def inputs(self, tree: Tree) -> Tree:
+        """Held."""
+        return lax.stop_gradient(tree)
+
+    def while_loop(
+        self,
+        unfinished: Callable[[State], Array],
+        body: Callable[[State], State],
+        start: State,
+        max_steps: int,
+    ) -> State:
+        """`lax.while_loop`; `unfinished` counts the steps."""
+        return lax.while_loop(unfinished, body, start)
+
+
+class RecursiveCheckpointAdjoint(AbstractAdjoint):
+    """Backwards through the steps that were taken, some of them computed again.
+
+    Right also where few steps were taken on purpose. Memory grows with the root of
+    `max_steps`, unless the number of `checkpoints` is given; reverse mode only.
+    """
+
+    checkpoints: int | None = eqx.field(default=None, static=True)
+
+    def inputs(self, tree: Tree) -> Tree:
+        """As they are."""
+        return tree
+
+    def while_loop(
+        self,
+        unfinished: Callable[[State], Array],
+        body: Callable[[State], State],
+        start: State,
+        max_steps: int,
+    ) -> State:
+        """Binomial checkpointing (Stumm and Walther 2010)."""
+        return eqxi.while_loop(
+            unfinished,
+            body,
+            start,
+            max_steps=max_steps,
+            kind="checkpointed",
+            checkpoints=self.checkpoints,
+        )

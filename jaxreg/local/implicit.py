@@ -1,0 +1,101 @@
+"""Derivatives of a registered pose by the implicit function theorem.
+
+Where a descent ends, the pulls of the matched points balance: b = 0, with weights by
+the kernel. The pose is differentiated through that equation, not through the loop.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg._core.typing import Motion, Scalar
+from jaxreg.local.descent import Descent, Limits
+from jaxreg.local.optimiser import LocalOptimiser
+from jaxreg.local.problem import Problem, match
+from jaxreg.local.steps import turn_and_shift
+from jaxreg.local.steps.base import full_matmul
+
+
+# Singular values below this share of the largest, in units of rounding, are free.
+_FREE = 100
+
+
+class _End(eqx.Module):
+    """What the balance at the end depends on; `found` is held."""
+
+    optimiser: LocalOptimiser
+    problem: Problem
+    width: Scalar
+    limits: Limits
+    found: Descent
+
+
+def stationary(
+    optimiser: LocalOptimiser,
+    problem: Problem,
+    width: Scalar,
+    limits: Limits,
+    end: Descent,
+) -> tuple[Motion, Scalar]:
+    """`end.T` and `end.scale`, with the derivatives of the pose that balances.
+
+    Args:
+        optimiser: residual, kernel and step; the first two may be differentiated.
+        problem: the pair, of which source and target may be.
+        width: kernel width at the end, which may be.
+        limits: those of the descent.
+        end: where it ended; the correspondences are its rows.
+    """
+    end = jax.lax.stop_gradient(end)
+    x = _correction(_End(optimiser, problem, width, limits, end))
+    k = x.shape[0] - limits.with_scale
+    T = turn_and_shift(end.T, x[:k])
+    return T, end.scale * jnp.exp(x[k]) if limits.with_scale else end.scale
+
+
+@eqx.filter_custom_jvp
+def _correction(at: _End) -> Float[Array, " k"]:
+    """The tangent from the end to the balance: zero, with derivatives."""
+    d = at.problem.source.shape[0]
+    k = 3 * (d - 1) + at.limits.with_scale
+    return jnp.zeros(k, at.problem.source.dtype)
+
+
+@_correction.def_jvp
+def _correction_jvp(primals: tuple[_End], tangents: tuple) -> tuple[Array, Array]:
+    (at,), zero = primals, _correction(*primals)
+    along = eqx.filter_jvp(lambda at: _pulls(zero, at), primals, tangents)[1]
+    A = jax.jacfwd(lambda x: _pulls(x, at))(zero)
+    # Directions that the data leave free do not follow.
+    U, s, Vt = jnp.linalg.svd(A)
+    held = s > _FREE * jnp.finfo(s.dtype).eps * s[0]
+    share = jnp.where(held, full_matmul(U.T, along[:, None])[:, 0], 0)
+    share = share / jnp.where(held, s, 1)
+    return zero, -full_matmul(Vt.T, share[:, None])[:, 0]
+
+
+def _pulls(x: Float[Array, " k"], at: _End) -> Float[Array, " k"]:
+    """b, and the pull on the scale if that is free, at a tangent from the end."""
+    d = at.problem.source.shape[0]
+    T = turn_and_shift(at.found.T, x[: 3 * (d - 1)])
+    scale = at.found.scale
+    if at.limits.with_scale:
+        scale = scale * jnp.exp(x[-1])
+    found = match(at.problem.scaled(scale), T, at.found.row)
+    found = at.limits.within_reach(found)
+    weight = at.optimiser.weights(found, at.width)
+    residual = at.optimiser.residual
+    b = jnp.sum(weight * residual.descents(found), axis=1)
+    if not at.limits.with_scale:
+        return b
+
+    def energy(s: Array) -> Array:
+        grown = eqx.tree_at(
+            lambda m: m.residual, found, found.residual - s * found.rotated
+        )
+        return residual.energy(grown, weight)
+
+    zero, one = jnp.zeros_like(at.width), jnp.ones_like(at.width)
+    slope = jax.jvp(energy, (zero,), (one,))[1]
+    return jnp.concatenate([b, -slope[None]])

@@ -1,0 +1,178 @@
+"""Derivatives of converged and of truncated solves: right, finite, and small."""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import blob, motion, move, switched_on
+from protocols import graph, measured
+
+import jaxreg as jr
+from jaxreg.cloud import PointCloud, estimate_normals
+from jaxreg.robust import L2, Cauchy, Tukey
+
+
+N = 48
+STEP = 1e-6
+POINTS = jr.PointToPoint()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _quickly_compiled() -> Iterator[None]:
+    """In double precision; these programs run once."""
+    with switched_on("jax_enable_x64", "jax_disable_most_optimizations"):
+        yield
+
+
+def _clouds(d: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Source, target, and a guess some degrees off."""
+    rng = np.random.default_rng(0)
+    source = blob(N, d).astype(float)
+    source = source - source.mean(0)
+    noisy = source + 0.05 * rng.standard_normal(source.shape)
+    target = move(motion(3, d, angle=0.1, shift=0.05), noisy)
+    guess = motion(5, d, angle=0.15, shift=0.02)
+    return jnp.asarray(source), jnp.asarray(target), jnp.asarray(guess)
+
+
+def _solve(method, source, target, guess, normals=None):
+    """In the frames of `solve`: normals are given, so they can be held."""
+    every, points = jnp.ones(N, bool), (source, target)
+    if normals is None:
+        normals = jnp.zeros_like(source), jnp.zeros_like(target)
+    clouds = (PointCloud(x, n, every) for x, n in zip(points, normals, strict=True))
+    return method.solve(*clouds, guess)
+
+
+def _answer(sol) -> jax.Array:
+    T = sol.T_target_source
+    return jnp.sum(jnp.cos(jnp.arange(T.size, dtype=T.dtype)).reshape(T.shape) * T)
+
+
+def _check_slopes(value, num: int):
+    """Against central differences in each of so many arguments."""
+    sides = STEP * np.concatenate([np.eye(num), -np.eye(num)])
+    at = jnp.asarray(np.concatenate([np.zeros((1, num)), sides]))
+    found, slopes = jax.jit(jax.vmap(jax.value_and_grad(value)))(at)
+    numeric = (found[1 : num + 1] - found[num + 1 :]) / (2 * STEP)
+    assert np.all(np.abs(numeric) > 1e-4)
+    np.testing.assert_allclose(slopes[0], numeric, rtol=1e-5)
+
+
+def test_pose_and_scale_follow_clouds_and_width_by_the_balance_of_pulls():
+    source, target, guess = _clouds(3)
+    normals = tuple(estimate_normals(x, jnp.ones(N, bool)) for x in (source, target))
+    rng = np.random.default_rng(1)
+    apart, turn = rng.standard_normal((N, 3)), rng.standard_normal((3, 3))
+    carried = target @ (turn - turn.T) + rng.standard_normal(3)
+
+    def value(x):
+        method = jr.ICP(
+            jr.PlaneToPlane(0.01),
+            Tukey(),
+            width_end=4.0 + x[2],
+            tolerance=1e-13,
+            max_steps=300,
+            with_scale=True,
+        )
+        moved = source + x[0] * apart, target + x[1] * carried
+        return _answer(_solve(method, *moved, guess, normals))
+
+    _check_slopes(value, 3)
+
+
+def test_a_truncated_descent_follows_its_guess_and_every_step():
+    source, target, guess = _clouds(2)
+    rng = np.random.default_rng(1)
+    apart = rng.standard_normal((N, 2))
+    method = jr.ICP(
+        POINTS, Cauchy(), max_steps=2, adjoint=jr.RecursiveCheckpointAdjoint()
+    )
+
+    def value(x):
+        start = guess.at[0, 2].add(x[1])
+        return _answer(_solve(method, source + x[0] * apart, target, start))
+
+    _check_slopes(value, 2)
+
+
+def _axes() -> jax.Array:
+    """Points along the axes: all singular values of their covariance coincide."""
+    radius = np.linspace(0.5, 1, N // 6)[:, None, None]
+    both = np.concatenate([np.eye(3), -np.eye(3)])
+    return jnp.asarray((radius * both).reshape(-1, 3))
+
+
+HALF_TURN = jnp.diag(jnp.asarray([-1.0, -1.0, 1.0, 1.0]))
+
+
+def test_registration_has_finite_gradients_where_formulas_are_singular():
+    """At the identity, a half turn, coinciding singular values, and zero residual."""
+    method = jr.ICP(POINTS, L2(), jr.ClosedForm())
+    source = _clouds(3)[0]
+    source = jnp.stack([source, source, _axes(), _axes()])
+    T = jnp.stack([jnp.eye(4), HALF_TURN, jnp.eye(4), HALF_TURN])
+    target = source @ jnp.swapaxes(T[:, :3, :3], 1, 2)
+
+    def value(source, target, T):
+        sol = _solve(method, source, target, T)
+        return _answer(sol), sol
+
+    slopes = jax.jit(jax.vmap(jax.grad(value, (0, 1), has_aux=True)))
+    (by_source, by_target), sol = slopes(source, target, T)
+    np.testing.assert_allclose(sol.T_target_source, T, atol=1e-12)
+    assert np.isfinite(by_source).all()
+    # Moving both points of every pair moves the answer as far as one of them did.
+    carried = jnp.einsum("bij,bnj->bni", T[:, :3, :3], by_source)
+    np.testing.assert_allclose(
+        jnp.sum(by_target, 1) @ jnp.ones(3),
+        jnp.sum(jnp.cos(jnp.asarray([3.0, 7.0, 11.0]))) * jnp.ones(4),
+        atol=1e-9,
+    )
+    assert np.abs(carried).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["exact", "half turns"])
+def test_averaging_has_finite_gradients_where_formulas_are_singular(name):
+    """Without any residual: at identities, and at half turns between all frames."""
+    T, weight = measured(3, float)
+    motion = jnp.eye(4) if name == "exact" else HALF_TURN
+    i, j = np.triu_indices(5, 1)
+    turned = jnp.asarray((i + j) % 2 == 1)[:, None, None]
+    T = jnp.where(turned, motion, jnp.eye(4))
+
+    def value(T, weight):
+        sol = jr.average(graph(T, weight), jr.MotionAveraging())
+        return jnp.sum(jnp.cos(jnp.arange(80.0)).reshape(5, 4, 4) * sol.T_world_i)
+
+    by_T, by_weight = jax.grad(value, (0, 1))(T, weight)
+    assert np.isfinite(by_T).all()
+    assert np.isfinite(by_weight).all()
+    assert np.abs(by_T).max() > 1e-3
+
+
+def _bytes(value, *args) -> int:
+    program = jax.jit(jax.grad(value)).lower(*args).compile()
+    found = program.memory_analysis()
+    assert found is not None
+    return found.temp_size_in_bytes
+
+
+def test_memory_of_a_gradient_does_not_grow_with_the_steps():
+    source, target, guess = _clouds(2)
+    T, weight = measured(3, float)
+
+    def registered(steps):
+        method = jr.ICP(POINTS, L2(), tolerance=0.0, max_steps=steps)
+        return lambda x: _answer(_solve(method, x, target, guess))
+
+    def averaged(steps):
+        method = jr.Correntropy(
+            "paper", tolerance=0.0, max_steps=steps, initialiser=jr.SpanningTree()
+        )
+        return lambda x: jnp.sum(jr.average(graph(x, weight), method).T_world_i[1])
+
+    for value, x in ((registered, source), (averaged, T)):
+        assert _bytes(value(1000), x) <= _bytes(value(10), x)
