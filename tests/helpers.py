@@ -1,6 +1,8 @@
 """Generators and paths that several tests share."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,20 @@ def data_dir(*parts: str) -> Path:
     if not path.exists():
         pytest.skip(f"real data not found: {'/'.join(parts)} (set JAXREG_DATA)")
     return path
+
+
+@contextmanager
+def switched_on(*names: str) -> Iterator[None]:
+    """With settings of JAX that are off by default."""
+    import jax
+
+    for name in names:
+        jax.config.update(name, True)
+    try:
+        yield
+    finally:
+        for name in names:
+            jax.config.update(name, False)
 
 
 def blob(n: int, d: int, seed: int = 0) -> np.ndarray:

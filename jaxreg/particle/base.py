@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import cast_floats, on_both
@@ -112,7 +113,10 @@ class AbstractSearch(AbstractRegistrar):
         key: Key,
     ) -> RegistrationSolution:
         """`solve` with indexes built before, for clouds that enter many pairs."""
-        self = cast_floats(self, source.points.dtype)
+        # Nothing is differentiated: the loops of a search know no reverse mode.
+        self, source, target, init = lax.stop_gradient(
+            (cast_floats(self, source.points.dtype), source, target, init)
+        )
         key_points, key_search = jax.random.split(key)
         pair = Pair(source, target, source_index, target_index)
         few = _some_points(key_points, pair.problem, self.num_points)

@@ -178,17 +178,6 @@ def test_edge_weights_name_the_outliers():
     assert "trusted" in repr(solution)
 
 
-def test_batches_agree_with_single_graphs():
-    cases = [random_graph(N, H, 0.1, seed) for seed in range(3)]
-    graphs = [single(X, edges, T) for X, edges, T, _ in cases]
-    batch = jax.tree.map(lambda *x: jnp.stack(x), *graphs)
-    many = jax.vmap(lambda g: average(g, METHODS["annealed"]))(batch)
-    assert many.status.shape == (3,)
-    for lane, graph in enumerate(graphs):
-        one = average(graph, METHODS["annealed"])
-        np.testing.assert_allclose(many.T_world_i[lane], one.T_world_i, atol=1e-4)
-
-
 @pytest.mark.parametrize("kind", ["averaging", "gauss-newton"])
 def test_gradients_agree_with_differences(kind):
     """At a fixed kernel width, since widths are cut from the gradient."""
@@ -329,13 +318,3 @@ def test_settings_do_not_recompile_and_solutions_are_arrays():
         solution = solve(graph, MotionAveraging(tolerance=tolerance))
     assert len(traces) == 1
     assert all(isinstance(x, jax.Array) for x in jax.tree.leaves(solution))
-
-
-def test_single_precision_stays_single_with_double_enabled():
-    X, edges, T, _ = random_graph(N, H, 0.1, 0)
-    with jax.enable_x64(True):
-        for name in METHODS:
-            graph = single(X, edges, T)
-            solution = jax.eval_shape(lambda g: average(g, METHODS[name]), graph)  # noqa: B023
-            floats = [x.dtype for x in jax.tree.leaves(solution) if x.dtype.kind == "f"]
-            assert set(floats) == {np.dtype(np.float32)}
