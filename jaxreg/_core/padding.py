@@ -12,14 +12,14 @@ from jaxreg._core.checks import as_float_array, check_mask, is_concrete
 _LEAST = 64
 
 
-def rounded_up(num_rows: int) -> int:
-    """The least size of 64, 80, 96, 112, 128, 160, ... that holds so many rows.
+def rounded_up(num_rows: int, least: int = _LEAST) -> int:
+    """The smallest size of 64, 80, 96, 112, 128, 160, ... that holds so many rows.
 
-    Four sizes an octave, so that few programs compile: a quarter more rows at most, a
-    ninth on average.
+    `least` is the first of them, a power of two of at least 4. Four sizes an octave, so
+    that few programs compile: a quarter more rows at most, a ninth on average.
     """
-    if num_rows <= _LEAST:
-        return _LEAST
+    if num_rows <= least:
+        return least
     step = 1 << ((num_rows - 1).bit_length() - 3)
     return -(-num_rows // step) * step
 

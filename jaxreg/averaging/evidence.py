@@ -4,7 +4,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.base import length_scale, masked_quantile, weighted_mean
+from jaxreg.averaging.base import (
+    length_scale,
+    masked_quantile,
+    num_held,
+    weighted_mean,
+)
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 
@@ -65,7 +70,7 @@ def redundancies(graph: PoseGraph, T_world_i: Array) -> Float[Array, " s"]:
     """
     count = votes(graph)
     usual = jnp.sum(count) / jnp.maximum(jnp.sum(count > 0), 1)
-    free = (graph.num_poses - 1) * usual
+    free = (num_held(graph) - 1) * usual
     return jnp.maximum(_agreed(graph, T_world_i, length_scale(graph)) - free, 0)
 
 
@@ -114,8 +119,9 @@ def coherence(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     weight, mean = table(count), weighted_mean(agreed, count)
     own = weighted_mean(table(count * agreed), jnp.ones_like(weight))
     own = own / jnp.maximum(jnp.mean(weight), jnp.finfo(sq.dtype).tiny)
-    chance = jnp.sqrt(mean * (1 - mean) / (0.5 * _NEIGHBOURS * num))
+    held = num_held(graph)
+    chance = jnp.sqrt(mean * (1 - mean) / (0.5 * _NEIGHBOURS * held))
     own = jnp.maximum(own - _CHANCE * chance, mean)
-    degree = 2 * jnp.sum((graph.weight > 0).astype(sq.dtype)) / num
+    degree = 2 * jnp.sum((graph.weight > 0).astype(sq.dtype)) / held
     select = jnp.maximum(1 - 2 * _NEIGHBOURS / jnp.maximum(degree, 1), 0) ** 3
     return _NEAR * select * own + mean

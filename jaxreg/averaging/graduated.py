@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.base import length_scale, masked_quantile
+from jaxreg.averaging.base import length_scale, masked_quantile, num_held
 from jaxreg.averaging.evidence import redundancies, redundancy
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, precisions
 from jaxreg.averaging.iterate import Iterated
@@ -97,7 +97,7 @@ def graduated(
             best,
             jnp.maximum(score, b.score),
             b.tried + 1,
-            (_redundant_share(believed, trust, fixed.num_poses) > _SETTLED)
+            (_redundant_share(believed, trust, num_held(fixed)) > _SETTLED)
             & _tight(fixed, believed, end.found.T),
         )
 
@@ -166,16 +166,16 @@ def _narrowed(graph: PoseGraph, doubt: Array, T_start: Array, max_steps: int) ->
     return jax.lax.while_loop(lambda s: ~s.done, turn, start)
 
 
-def _redundant_share(believed: Array, trust: Array, num_poses: int) -> Array:
+def _redundant_share(believed: Array, trust: Array, frames: Array) -> Array:
     """Trusted edges over all believed ones, beyond those that a tree takes."""
-    tree = num_poses - 1
+    tree = frames - 1
     trusted = jnp.sum(believed & (trust > 0.5)) - tree
     return trusted / jnp.maximum(jnp.sum(believed) - tree, 1)
 
 
 def _tight(graph: PoseGraph, believed: Array, T_world_i: Array) -> Array:
     """Do the edges agree at the coarsest scale, and not just under a wide kernel?"""
-    spare = jnp.sum(believed) - (graph.num_poses - 1)
+    spare = jnp.sum(believed) - (num_held(graph) - 1)
     return redundancies(graph, T_world_i)[0] > 0.5 * spare
 
 
@@ -190,7 +190,7 @@ def _first_width(graph: PoseGraph, believed: Array, T: Array, squares: Array) ->
     """
     present = (graph.weight > 0) & believed
     open_edges = _open_edges(graph, T) & believed
-    chained = jnp.sum(present & ~open_edges) > 0.5 * (graph.num_poses - 1)
+    chained = jnp.sum(present & ~open_edges) > 0.5 * (num_held(graph) - 1)
     middle = masked_quantile(squares, present, 0.5)
     middle = middle / CHI2_MEDIAN[lie.tangent_dim(graph.dim)]
     spread = _FIRST * jnp.sqrt(middle * _spare(graph))
@@ -246,5 +246,5 @@ def _parts(graph: PoseGraph, T: Array, trust: Array) -> Float[Array, "2"]:
 def _spare(graph: PoseGraph) -> Array:
     """Edges over those that the poses do not use up, at most 4."""
     count = jnp.sum(graph.weight > 0).astype(graph.weight.dtype)
-    spare = jnp.maximum(count - (graph.num_poses - 1), 0.25 * count)
+    spare = jnp.maximum(count - (num_held(graph) - 1), 0.25 * count)
     return count / jnp.maximum(spare, 1)

@@ -103,7 +103,7 @@ class PoseGraph(eqx.Module):
         graph = cls(
             edges=ids,
             T_i_j=motions,
-            weight=jnp.ones((num,), dtype) if weights is None else weights,
+            weight=jax.device_put(np.ones(num, dtype)) if weights is None else weights,
             mask=valid,
             information=info,
             num_poses=num_poses,
@@ -112,15 +112,22 @@ class PoseGraph(eqx.Module):
 
     def _cleaned(self) -> "PoseGraph":
         """The graph with harmless values in the masked rows."""
-        eye = jnp.eye(self.T_i_j.shape[-1], dtype=self.T_i_j.dtype)
-        keep = self.mask[:, None, None]
-        info = self.information
+        # On the host if it can be: another number of edges compiles nothing.
+        on_host = all(map(is_concrete, jax.tree.leaves(self)))
+        xp = np if on_host else jnp
+        edges, T, weight, mask, info = (
+            None if x is None else xp.asarray(x)
+            for x in (self.edges, self.T_i_j, self.weight, self.mask, self.information)
+        )
+        put = jax.device_put if on_host else jnp.asarray
+        keep = mask[:, None, None]
+        eye = xp.eye(T.shape[-1], dtype=T.dtype)
         return PoseGraph(
-            edges=jnp.where(self.mask[:, None], self.edges, 0),
-            T_i_j=jnp.where(keep, self.T_i_j, eye),
-            weight=jnp.where(self.mask, self.weight, 0),
-            mask=self.mask,
-            information=None if info is None else jnp.where(keep, info, 0),
+            edges=put(xp.where(mask[:, None], edges, 0)),
+            T_i_j=put(xp.where(keep, T, eye)),
+            weight=put(xp.where(mask, weight, 0)),
+            mask=put(mask),
+            information=None if info is None else put(xp.where(keep, info, 0)),
             num_poses=self.num_poses,
         )
 
@@ -241,7 +248,9 @@ def _check_ids(edges: object, num: int) -> Int[Array, "e 2"]:
                 "edges: ids must lie between 0 and 2^31 - 1, found "
                 f"{ids.min()} to {ids.max()}."
             )
-    return jnp.asarray(ids).astype(jnp.int32)
+    if isinstance(ids, np.ndarray):
+        return jax.device_put(ids.astype(np.int32))
+    return ids.astype(jnp.int32)
 
 
 def _check_extra(

@@ -1,0 +1,98 @@
+"""One graph: reduced to what frame 0 reaches, averaged, and put at its place."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core.arrays import cast_floats
+from jaxreg._core.compile import compiled
+from jaxreg._core.status import Status
+from jaxreg._core.typing import Key
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution
+from jaxreg.geometry import lie
+from jaxreg.graph import trees
+from jaxreg.graph.pose_graph import PoseGraph
+
+
+def average_graph(
+    graph: PoseGraph,
+    method: AbstractAverager,
+    init: Float[Array, "v D D"] | None,
+    key: Key | None,
+    present: Bool[Array, " v"] | None = None,
+) -> AveragingSolution:
+    """`average` of checked arguments; frames that are not `present` are padding."""
+    reduced, method, T_start, gauge = _prepared(graph, method, init)
+    return _placed(method.solve(reduced, T_start, key), gauge, present)
+
+
+class _Gauge(NamedTuple):
+    T_world_0: Array
+    component: Array
+    finite: Array
+
+
+@compiled
+def _prepared(
+    graph: PoseGraph, method: AbstractAverager, init: Float[Array, "v D D"] | None
+) -> tuple[PoseGraph, AbstractAverager, Float[Array, "v D D"] | None, _Gauge]:
+    """What a method needs: a graph joined to frame 0, which is at the identity."""
+    dtype, d = graph.T_i_j.dtype, graph.dim
+    method = cast_floats(method, dtype)
+    reduced, component, finite = _reduce(graph)
+    T_start, T_world_0 = None, jnp.eye(d + 1, dtype=dtype)
+    if init is not None:
+        sound = jnp.all(jnp.isfinite(init), axis=(1, 2))
+        finite = finite & jnp.all(sound)
+        init = jnp.where(sound[:, None, None], init, jnp.eye(d + 1, dtype=dtype))
+        T_world_0 = init[0]
+        T_start = lie.inverse(T_world_0) @ init
+    return reduced, method, T_start, _Gauge(T_world_0, component, finite)
+
+
+@compiled
+def _placed(
+    out: AveragingSolution, gauge: _Gauge, present: Bool[Array, " v"] | None
+) -> AveragingSolution:
+    T_0_i, placed = out.T_world_i, gauge.component == gauge.component[0]
+    eye = jnp.eye(T_0_i.shape[-1], dtype=T_0_i.dtype)
+    sound = jnp.all(jnp.isfinite(T_0_i), axis=(1, 2))
+    T_world_i = jnp.where(sound[:, None, None], gauge.T_world_0 @ T_0_i, eye)
+    T_world_i = jnp.where(placed[:, None, None], T_world_i, eye)
+    reached = jnp.all(placed if present is None else placed | ~present)
+    status = jnp.where(reached, out.status, Status.DISCONNECTED)
+    finite = gauge.finite & jnp.all(sound)
+    status = jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)
+    return eqx.tree_at(
+        lambda s: (s.T_world_i, s.placed, s.component, s.status),
+        out,
+        (T_world_i, placed, gauge.component, status),
+    )
+
+
+def _reduce(graph: PoseGraph) -> tuple[PoseGraph, Array, Array]:
+    """The graph without edges that are masked, not finite, or not joined to frame 0.
+
+    Also the component of each frame, and whether all numbers were finite.
+    """
+    finite = jnp.all(jnp.isfinite(graph.T_i_j), axis=(1, 2)) & (
+        jnp.isfinite(graph.weight) & (graph.weight >= 0)
+    )
+    used = graph.mask & finite & (graph.edges[:, 0] != graph.edges[:, 1])
+    weight = jnp.where(used, graph.weight, 0)
+    component = trees.components(graph.edges, weight, graph.num_poses)
+    placed = component == component[0]
+    used = used & placed[graph.edges[:, 0]]
+    eye = jnp.eye(graph.dim + 1, dtype=graph.T_i_j.dtype)
+    info = graph.information
+    reduced = PoseGraph(
+        edges=jnp.where(used[:, None], graph.edges, 0),
+        T_i_j=jnp.where(used[:, None, None], graph.T_i_j, eye),
+        weight=jnp.where(used, weight, 0),
+        mask=used,
+        information=None if info is None else jnp.where(used[:, None, None], info, 0),
+        num_poses=graph.num_poses,
+    )
+    return reduced, component, jnp.all(finite | ~graph.mask)

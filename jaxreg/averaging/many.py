@@ -1,0 +1,163 @@
+"""Many graphs of unequal sizes: padded to few sizes, some side by side."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxreg._core.checks import as_float_array, is_concrete
+from jaxreg._core.compile import compiled
+from jaxreg._core.padding import rounded_up, stacked
+from jaxreg._core.typing import Key
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution
+from jaxreg.averaging.gauge import average_graph
+from jaxreg.graph.pose_graph import PoseGraph
+
+
+# The least sizes that graphs are padded to.
+_LEAST_POSES, _LEAST_EDGES = 8, 16
+
+
+def check_graph(graph: object, name: str) -> PoseGraph:
+    """Requires a PoseGraph."""
+    if not isinstance(graph, PoseGraph):
+        raise TypeError(
+            f"{name}: wanted a PoseGraph (see PoseGraph.from_edges), "
+            f"found {type(graph).__name__}."
+        )
+    return graph
+
+
+def check_init(
+    init: object, graph: PoseGraph, name: str
+) -> Float[Array, "v D D"] | None:
+    """Requires a pose for each frame, or None."""
+    if init is None:
+        return None
+    wanted = (graph.num_poses, graph.dim + 1, graph.dim + 1)
+    found = as_float_array(init, name).astype(graph.T_i_j.dtype)
+    if found.shape != wanted:
+        raise ValueError(f"{name}: wanted shape {wanted}, found {found.shape}.")
+    return found
+
+
+def average_list(
+    graphs: Sequence[object],
+    method: AbstractAverager,
+    init: object,
+    key: Key | None,
+    batch_size: int,
+) -> list[AveragingSolution]:
+    """`average` of each; graphs of similar sizes share a program."""
+    checked = _check_alike(graphs)
+    inits = _check_inits(init, checked)
+    keys = None if key is None else jax.random.split(key, len(checked))
+    sizes = np.array([rounded_up(g.num_poses, _LEAST_POSES) for g in checked])
+    out: list[Any] = [None] * len(checked)
+    for num_poses in np.unique(sizes):
+        rows = np.flatnonzero(sizes == num_poses)
+        some = [checked[k] for k in rows]
+        starts = None if inits is None else [inits[k] for k in rows]
+        lanes = _padded(some, starts, int(num_poses))
+        own_keys = None if keys is None else keys[rows]
+        found = _average_lanes(method, *lanes, own_keys, batch_size)
+        if is_concrete(found.status):
+            found = jax.tree.map(np.asarray, found)  # slices compile nothing
+        for lane, k in enumerate(rows):
+            out[k] = _cut(found, lane, checked[k])
+    return out
+
+
+def _check_alike(graphs: Sequence[object]) -> list[PoseGraph]:
+    checked = [check_graph(g, f"graph[{i}]") for i, g in enumerate(graphs)]
+    for i, g in enumerate(checked):
+        first = checked[0]
+        if g.T_i_j.dtype != first.T_i_j.dtype:
+            raise TypeError(
+                f"graph[{i}]: wanted dtype {first.T_i_j.dtype} like graph[0], found "
+                f"{g.T_i_j.dtype}."
+            )
+        if g.dim != first.dim:
+            raise ValueError(
+                f"graph[{i}]: wanted dimension {first.dim} like graph[0], found "
+                f"{g.dim}."
+            )
+        if (g.information is None) != (first.information is None):
+            raise ValueError(
+                f"graph[{i}]: wanted information for all graphs or for none."
+            )
+    return checked
+
+
+def _check_inits(init: object, graphs: list[PoseGraph]) -> list[Array] | None:
+    if init is None:
+        return None
+    if not isinstance(init, list | tuple) or len(init) != len(graphs):
+        found = len(init) if isinstance(init, list | tuple) else type(init).__name__
+        raise ValueError(f"init: wanted a list of {len(graphs)}, found {found}.")
+    checked = [
+        check_init(T, g, f"init[{i}]")
+        for i, (T, g) in enumerate(zip(init, graphs, strict=True))
+    ]
+    if any(T is None for T in checked):
+        raise ValueError("init: wanted poses for all graphs or None for the list.")
+    return [T for T in checked if T is not None]
+
+
+def _padded(
+    graphs: list[PoseGraph], inits: list[Array] | None, num_poses: int
+) -> tuple[PoseGraph, Array, Array | None]:
+    """Graphs with a leading axis, which frames they have, and their starts."""
+    num_edges = rounded_up(max(g.num_edges for g in graphs), _LEAST_EDGES)
+
+    # Built from a tree: fields with a leading axis are no PoseGraph's.
+    same = [dataclasses.replace(g, num_poses=num_poses) for g in graphs]
+    batch = jax.tree.map(lambda *x: stacked(x, num_edges), *same)
+    counts = np.array([g.num_poses for g in graphs])
+    present = jax.device_put(np.arange(num_poses) < counts[:, None])
+    starts = None if inits is None else stacked(inits, num_poses)
+    return batch, present, starts
+
+
+@compiled
+def _average_lanes(
+    method: AbstractAverager,
+    graphs: PoseGraph,
+    present: Array,
+    inits: Array | None,
+    keys: Array | None,
+    batch_size: int,
+) -> AveragingSolution:
+    def one(lane: tuple) -> AveragingSolution:
+        graph, present, init, key = lane
+        if init is not None:
+            eye = jnp.eye(init.shape[-1], dtype=init.dtype)
+            init = jnp.where(present[:, None, None], init, eye)
+        return average_graph(graph, method, init, key, present)
+
+    # Groups of one would be vectorised over an axis of one: conditions become selects.
+    size = batch_size if batch_size > 1 else None
+    return lax.map(one, (graphs, present, inits, keys), batch_size=size)
+
+
+def _cut(found: AveragingSolution, lane: int, graph: PoseGraph) -> AveragingSolution:
+    """The solution of one graph without its padding."""
+    v, e = graph.num_poses, graph.num_edges
+    put = jax.device_put if is_concrete(found.status) else jnp.asarray
+    return AveragingSolution(
+        T_world_i=put(found.T_world_i[lane, :v]),
+        edge_weight=put(found.edge_weight[lane, :e]),
+        agreement=put(found.agreement[lane]),
+        status=put(found.status[lane]),
+        placed=put(found.placed[lane, :v]),
+        component=put(found.component[lane, :v]),
+        kernel_width=put(found.kernel_width[lane]),
+        num_steps=put(found.num_steps[lane]),
+        residual=put(found.residual[lane]),
+        length_scale=put(found.length_scale[lane]),
+    )

@@ -1,0 +1,119 @@
+"""Lists of graphs of unequal sizes."""
+
+import jax
+import numpy as np
+import pytest
+
+import jaxreg as jr
+from jaxreg import Status
+from jaxreg.averaging import many
+from tests.averaging.graphs import random_graph
+
+
+SIZES = [(9, 20), (10, 30), (7, 15), (10, 22)]
+PLAIN = jr.MotionAveraging()
+
+
+def _graphs(sizes, outliers: float = 0.1):
+    cases = [random_graph(*size, outliers, seed) for seed, size in enumerate(sizes)]
+    return [
+        jr.PoseGraph.from_edges(edges, T.astype(np.float32), len(X))
+        for X, edges, T, _ in cases
+    ]
+
+
+@pytest.mark.parametrize(
+    "method", [PLAIN, jr.Correntropy()], ids=lambda m: type(m).__name__
+)
+def test_padding_changes_an_answer_by_rounding_only(method):
+    graphs = _graphs(SIZES)
+    found = jr.average(graphs, method)
+    for graph, padded in zip(graphs, found, strict=True):
+        alone = jr.average(graph, method)
+        assert int(padded.status) == int(alone.status) == Status.CONVERGED
+        assert padded.T_world_i.shape == alone.T_world_i.shape
+        np.testing.assert_allclose(padded.T_world_i, alone.T_world_i, atol=1e-4)
+        np.testing.assert_allclose(padded.edge_weight, alone.edge_weight, atol=1e-3)
+        np.testing.assert_array_equal(padded.placed, alone.placed)
+        np.testing.assert_array_equal(padded.component, alone.component)
+
+
+def test_a_hundred_sizes_compile_once_a_bucket_and_settings_never():
+    sizes = [(8 + k % 9, 20 + k // 4) for k in range(100)]
+    graphs = _graphs(sizes, outliers=0.0)
+    programs = many._average_lanes
+    names = []
+
+    def hear(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event.endswith("backend_compile_duration"):
+            names.append(str(kwargs["fun_name"]))
+
+    jax.monitoring.register_event_duration_secs_listener(hear)
+    try:
+        found = jr.average(graphs, PLAIN)
+        first = len(names)
+        jr.average(graphs, jr.MotionAveraging(tolerance=1e-5))
+    finally:
+        jax.monitoring.unregister_event_duration_listener(hear)
+    # 8, 10, 12, 14 and 16 poses.
+    assert len([name for name in names if programs.__name__ in name]) == 5
+    assert first == len(names)
+    assert first < 20
+    assert {int(sol.status) for sol in found} == {Status.CONVERGED}
+
+
+def test_a_graph_without_valid_edges_has_its_status_and_the_others_their_poses():
+    graphs = _graphs(SIZES[:3])
+    nothing = np.zeros(graphs[1].num_edges, bool)
+    edges, T = np.asarray(graphs[1].edges), np.asarray(graphs[1].T_i_j)
+    graphs[1] = jr.PoseGraph.from_edges(edges, T, 10, mask=nothing)
+    found = jr.average(graphs, PLAIN)
+    assert [int(sol.status) for sol in found] == [
+        Status.CONVERGED,
+        Status.DISCONNECTED,
+        Status.CONVERGED,
+    ]
+    alone = jr.average(graphs[2], PLAIN)
+    np.testing.assert_allclose(found[2].T_world_i, alone.T_world_i, atol=1e-5)
+
+
+def test_memory_grows_with_the_batch_that_is_asked_for():
+    graphs = _graphs([(10, 30)] * 32, outliers=0.0)
+    lanes = many._padded(graphs, None, 10)
+
+    def size(batch_size: int) -> int:
+        def run(*lanes):
+            return many._average_lanes(PLAIN, *lanes, None, batch_size).T_world_i
+
+        memory = jax.jit(run).lower(*lanes).compile().memory_analysis()
+        assert memory is not None
+        return memory.temp_size_in_bytes
+
+    one, four, all_at_once = size(1), size(4), size(32)
+    assert one < four < all_at_once
+    # 100 kB a graph of 10 poses and 30 edges in a batch.
+    assert all_at_once < 32 * 1e5
+
+
+def test_lists_stand_inside_jit():
+    graphs = _graphs(SIZES[:2])
+
+    @jax.jit
+    def poses(graphs):
+        return [sol.T_world_i for sol in jr.average(graphs, PLAIN)]
+
+    found = poses(graphs)
+    for T, sol in zip(found, jr.average(graphs, PLAIN), strict=True):
+        np.testing.assert_allclose(T, sol.T_world_i, atol=1e-5)
+
+
+def test_wrong_lists_are_named():
+    graphs = _graphs(SIZES[:2])
+    X, edges, T, _ = random_graph(7, 15, 0.0, 2, d=2)
+    flat = jr.PoseGraph.from_edges(edges, T.astype(np.float32))
+    with pytest.raises(ValueError, match=r"graph\[2\]: wanted dimension 3"):
+        jr.average([*graphs, flat])
+    with pytest.raises(ValueError, match="init: wanted a list of 2"):
+        jr.average(graphs, init=np.eye(4))
+    with pytest.raises(ValueError, match="batch_size"):
+        jr.average(graphs, batch_size=0)
