@@ -72,7 +72,7 @@ def test_pose_and_scale_follow_clouds_and_width_by_the_balance_of_pulls():
         method = jr.ICP(
             jr.PlaneToPlane(0.01),
             Tukey(),
-            width_end=4.0 + x[2],
+            width_end=1.0 + x[2],
             tolerance=1e-13,
             max_steps=300,
             with_scale=True,
@@ -88,7 +88,11 @@ def test_a_truncated_descent_follows_its_guess_and_every_step():
     rng = np.random.default_rng(1)
     apart = rng.standard_normal((N, 2))
     method = jr.ICP(
-        POINTS, Cauchy(), max_steps=2, adjoint=jr.RecursiveCheckpointAdjoint()
+        POINTS,
+        Cauchy(),
+        max_steps=2,
+        width_end=3.0,
+        adjoint=jr.RecursiveCheckpointAdjoint(),
     )
 
     def value(x):

@@ -96,5 +96,5 @@ def average(
         raise ValueError(f"batch_size: wanted at least 1, found {batch_size}.")
     if isinstance(graph, list | tuple):
         return average_list(graph, method, init, key, batch_size)
-    check_graph(graph, "graph")
-    return average_graph(graph, method, check_init(init, graph, "init"), key)
+    one = check_graph(graph, "graph")
+    return average_graph(one, method, check_init(init, one, "init"), key)

@@ -114,20 +114,21 @@ class PoseGraph(eqx.Module):
         """The graph with harmless values in the masked rows."""
         # On the host if it can be: another number of edges compiles nothing.
         on_host = all(map(is_concrete, jax.tree.leaves(self)))
-        xp = np if on_host else jnp
-        edges, T, weight, mask, info = (
-            None if x is None else xp.asarray(x)
-            for x in (self.edges, self.T_i_j, self.weight, self.mask, self.information)
-        )
-        put = jax.device_put if on_host else jnp.asarray
+        put, host = (jax.device_put, np.asarray) if on_host else (jnp.asarray,) * 2
+        mask = host(self.mask)
         keep = mask[:, None, None]
-        eye = xp.eye(T.shape[-1], dtype=T.dtype)
+
+        def where(real: Any, x: Array, other: Any) -> Array:
+            return put((np if on_host else jnp).where(real, host(x), other))
+
+        eye = np.eye(self.T_i_j.shape[-1], dtype=self.T_i_j.dtype)
+        info = self.information
         return PoseGraph(
-            edges=put(xp.where(mask[:, None], edges, 0)),
-            T_i_j=put(xp.where(keep, T, eye)),
-            weight=put(xp.where(mask, weight, 0)),
-            mask=put(mask),
-            information=None if info is None else put(xp.where(keep, info, 0)),
+            edges=where(mask[:, None], self.edges, 0),
+            T_i_j=where(keep, self.T_i_j, eye),
+            weight=where(mask, self.weight, 0),
+            mask=self.mask,
+            information=None if info is None else where(keep, info, 0),
             num_poses=self.num_poses,
         )
 

@@ -217,9 +217,11 @@ class ICP(AbstractRegistrar):
         """Whether the guess fits better than the match at the end."""
         every = limits.stride(found.mask.shape[0])
         mask = problem.every(every).source_mask
+        # A guess that fits exactly is not better than an end that fits up to rounding.
+        rounding = (256 * jnp.finfo(end.width.dtype).eps) ** 2
 
         def loss(sq_residual: Array) -> Array:
-            sq = jnp.minimum(sq_residual, limits.farthest**2)
+            sq = jnp.minimum(sq_residual + rounding, limits.farthest**2)
             return jnp.sum(jnp.where(mask, self.kernel.rho(sq, end.width), 0))
 
         last = found.sq_residual[::every]

@@ -10,12 +10,12 @@ from jaxreg.averaging import many
 from tests.averaging.graphs import random_graph
 
 
-SIZES = [(9, 20), (10, 30), (7, 15), (10, 22)]
+SIZES = [(9, 20), (10, 30), (7, 15)]
 PLAIN = jr.MotionAveraging()
 
 
 def _graphs(sizes, outliers: float = 0.1):
-    cases = [random_graph(*size, outliers, seed) for seed, size in enumerate(sizes)]
+    cases = [random_graph(n, e, outliers, k) for k, (n, e) in enumerate(sizes)]
     return [
         jr.PoseGraph.from_edges(edges, T.astype(np.float32), len(X))
         for X, edges, T, _ in cases
@@ -26,22 +26,21 @@ def _graphs(sizes, outliers: float = 0.1):
     "method", [PLAIN, jr.Correntropy()], ids=lambda m: type(m).__name__
 )
 def test_padding_changes_an_answer_by_rounding_only(method):
-    graphs = _graphs(SIZES)
-    found = jr.average(graphs, method)
-    for graph, padded in zip(graphs, found, strict=True):
-        alone = jr.average(graph, method)
-        assert int(padded.status) == int(alone.status) == Status.CONVERGED
-        assert padded.T_world_i.shape == alone.T_world_i.shape
-        np.testing.assert_allclose(padded.T_world_i, alone.T_world_i, atol=1e-4)
-        np.testing.assert_allclose(padded.edge_weight, alone.edge_weight, atol=1e-3)
-        np.testing.assert_array_equal(padded.placed, alone.placed)
-        np.testing.assert_array_equal(padded.component, alone.component)
+    graphs = _graphs(SIZES[:2])
+    padded = jr.average(graphs, method)[0]  # to the poses and edges of the other
+    alone = jr.average(graphs[0], method)
+    assert int(padded.status) == int(alone.status) == Status.CONVERGED
+    assert padded.T_world_i.shape == alone.T_world_i.shape
+    np.testing.assert_allclose(padded.T_world_i, alone.T_world_i, atol=1e-4)
+    np.testing.assert_allclose(padded.edge_weight, alone.edge_weight, atol=1e-3)
+    np.testing.assert_array_equal(padded.placed, alone.placed)
+    np.testing.assert_array_equal(padded.component, alone.component)
 
 
 def test_a_hundred_sizes_compile_once_a_bucket_and_settings_never():
-    sizes = [(8 + k % 9, 20 + k // 4) for k in range(100)]
+    sizes = [(8 + k % 9, 14 + k // 8) for k in range(100)]
     graphs = _graphs(sizes, outliers=0.0)
-    programs = many._average_lanes
+    programs, other = many._average_lanes, jr.MotionAveraging(tolerance=1e-5)
     names = []
 
     def hear(event: str, duration_secs: float, **kwargs: str | int) -> None:
@@ -52,12 +51,12 @@ def test_a_hundred_sizes_compile_once_a_bucket_and_settings_never():
     try:
         found = jr.average(graphs, PLAIN)
         first = len(names)
-        jr.average(graphs, jr.MotionAveraging(tolerance=1e-5))
+        jr.average(graphs, other)
     finally:
         jax.monitoring.unregister_event_duration_listener(hear)
     # 8, 10, 12, 14 and 16 poses.
     assert len([name for name in names if programs.__name__ in name]) == 5
-    assert first == len(names)
+    assert not names[first:]
     assert first < 20
     assert {int(sol.status) for sol in found} == {Status.CONVERGED}
 
@@ -82,8 +81,10 @@ def test_memory_grows_with_the_batch_that_is_asked_for():
     lanes = many._padded(graphs, None, 10)
 
     def size(batch_size: int) -> int:
-        def run(*lanes):
-            return many._average_lanes(PLAIN, *lanes, None, batch_size).T_world_i
+        def run(graph, present, init):
+            keys = None
+            found = many._average_lanes(PLAIN, graph, present, init, keys, batch_size)
+            return found.T_world_i
 
         memory = jax.jit(run).lower(*lanes).compile().memory_analysis()
         assert memory is not None
