@@ -1,6 +1,10 @@
 """`register` as its users call it."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -164,6 +168,21 @@ def test_same_key_same_bits():
         jr.register(source, target, FILTER, key=jax.random.key(7)) for _ in range(2)
     )
     np.testing.assert_array_equal(first.T_target_source, again.T_target_source)
+    program = (
+        "import jax, numpy, jaxreg, test_registration as t;"
+        "source, target, _ = t._pair(3, 0); key = jax.random.key(7);"
+        "sol = jaxreg.register(source, target, t.FILTER, key=key);"
+        "print(numpy.asarray(sol.T_target_source).tobytes().hex())"
+    )
+    places = [str(Path(__file__).parent), str(Path(jr.__file__).parents[1])]
+    out = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(places)},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert bytes.fromhex(out.strip()) == np.asarray(first.T_target_source).tobytes()
 
 
 class _Centroids(AbstractRegistrar):
@@ -365,6 +384,9 @@ TWO = {"target": [CUBE] * 2}
         ({"source": np.ones((0, 3))}, ValueError, "source.*no points"),
         ({"source": np.ones((5, 3), np.float16)}, TypeError, "source.*float16"),
         ({"source": np.ones((5, 3), complex)}, TypeError, "source.*complex"),
+        ({"source": jnp.ones((5, 3), jnp.bfloat16)}, TypeError, "source.*bfloat16"),
+        ({"source": np.ones((2, 5, 3))}, ValueError, "target.*leading axes"),
+        ({"init": np.eye(4, dtype=complex)}, TypeError, "init.*complex"),
         ({"source": [["a", "b", "c"]]}, TypeError, "source.*numbers"),
         ({"source_mask": np.ones(4, bool)}, ValueError, "source_mask.*shape"),
         ({"target_mask": np.ones(M)}, TypeError, "target_mask.*boolean"),

@@ -87,6 +87,15 @@ def test_wrong_shapes_are_named(kwargs, message):
 def test_wrong_types_are_named():
     with pytest.raises(TypeError, match="edges: wanted integers"):
         PoseGraph.from_edges(EDGES * 1.0, motions())
+    for dtype in (np.float16, complex):
+        with pytest.raises(TypeError, match="T_i_j: wanted float32 or float64"):
+            PoseGraph.from_edges(EDGES, motions().astype(dtype))
+    with pytest.raises(TypeError, match="mask: wanted a boolean"):
+        PoseGraph.from_edges(EDGES, motions(), mask=np.ones(4))
+
+
+def test_doubles_are_singles_where_jax_has_no_doubles():
+    assert PoseGraph.from_edges(EDGES, motions().astype(float)).weight.dtype == "f4"
 
 
 def test_nearly_orthonormal_rotations_are_projected():
