@@ -180,3 +180,19 @@ def test_memory_of_a_gradient_does_not_grow_with_the_steps():
 
     for value, x in ((registered, source), (averaged, T)):
         assert _bytes(value(1000), x) <= _bytes(value(10), x)
+
+
+def test_forward_mode_passes_through_batches_of_compiled_registrations():
+    source, target, guess = _clouds(2)
+    method = jr.ICP(POINTS, L2(), jr.ClosedForm())
+
+    @jax.jit
+    def shifted(x, shift):
+        return _answer(_solve(method, source + shift * x, target, guess))
+
+    def batch(x):
+        return jax.vmap(shifted, (None, 0))(x, jnp.asarray([0.01, 0.02]))
+
+    x = jnp.ones(2)
+    out = jax.eval_shape(jax.jacfwd(batch), x)
+    assert out.shape == (2, 2)

@@ -59,7 +59,9 @@ def _correction(at: _End) -> Float[Array, " k"]:
     """The tangent from the end to the balance: zero, with derivatives."""
     d = at.problem.source.shape[0]
     k = 3 * (d - 1) + at.limits.with_scale
-    return jnp.zeros(k, at.problem.source.dtype)
+    zero = jnp.zeros(k, at.problem.source.dtype)
+    # A constant has no lanes under `vmap`, but its tangent has: JAX mixes them up.
+    return jnp.where(jnp.isnan(at.found.T[0, 0]), -zero, zero)
 
 
 @_correction.def_jvp
