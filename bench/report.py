@@ -31,7 +31,8 @@ it and drew its plots.
 How it is measured. Every workload runs in a process of its own, pinned to the number of
 cores that its tables state; OpenMP, BLAS and XLA have as many threads. Methods of a
 table are called in turn, in an order that changes, on the same inputs. CPU time is that
-of all threads of a call, the median over all calls (never fewer than five) with its
+of all threads of a call, the median over all calls (five or more, or three that take
+minutes) with its
 quartiles in brackets. `first call` is wall time of the first call, with compilation for
 JAX (no compilation cache); `prepare` what is built once for all trials, compiled
 before. Where wall time is far above CPU time, the machine had other work. `memory` is

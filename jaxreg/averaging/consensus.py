@@ -23,6 +23,7 @@ from jaxreg.averaging.evidence import (
     squared_errors,
 )
 from jaxreg.averaging.laplacian import DENSE_LIMIT
+from jaxreg.averaging.long_cycles import long_cycle_odds
 from jaxreg.averaging.moves import frames_moved, groups_moved, settled
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
@@ -43,11 +44,12 @@ class CycleConsensus(AbstractAverager):
 
     Each edge gets log odds from its 3-cycles at several scales (`edge_log_odds`), and
     each scale the tree of greatest odds. If the best contradicts believed edges, or
-    some frame is reached by doubtful edges alone, further trees are drawn with randomly
-    perturbed odds, round by round around the best so far, and the best is changed by
-    moving single frames, and groups beyond an edge of a tree, to where most of their
-    edges put them. All are compared by how well frames agree with those next to them
-    (`coherence`), over a ladder of scales: no noise level is needed. Up to
+    some frame is reached by doubtful edges alone, long cycles are asked as well
+    (`long_cycle_odds`). Where that does not settle it, further trees are drawn with
+    randomly perturbed odds, round by round around the best so far, and the best is
+    changed by moving single frames, and groups beyond an edge of a tree, to where most
+    of their edges put them. All are compared by how well frames agree with those next
+    to them (`coherence`), over a ladder of scales: no noise level is needed. Up to
     `DENSE_LIMIT` frames, the best of a round settle and are compared once more.
 
     Graphs too large for cycles get the better of the tree of greatest prior weight and
@@ -110,6 +112,7 @@ class CycleConsensus(AbstractAverager):
     def _searched(self, graph: PoseGraph, begun: "_Found") -> "_Found":
         graph = jax.lax.stop_gradient(graph)
         scale = length_scale(graph)
+        begun = _by_long_cycles(graph, begun, scale)
 
         def unfinished(s: _Search) -> Array:
             return ~s.settled & (s.round < self.rounds) & (s.idle < _PATIENCE)
@@ -152,6 +155,30 @@ class CycleConsensus(AbstractAverager):
             round=s.round + 1,
             key=key,
         )
+
+
+def _by_long_cycles(graph: PoseGraph, found: "_Found", scale: Array) -> "_Found":
+    """With the trees that long cycles confirm as further starts."""
+    s = found.search
+    key, grow = jax.random.split(s.key)
+    odds = long_cycle_odds(graph, found.odds[0], grow)
+    likely = jnp.where(graph.weight > 0, jax.nn.sigmoid(found.odds[0]), 0)
+    T = jax.vmap(lambda o: _forest(graph, o + likely).T_world_i)(odds)
+    score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
+    best = jnp.argmax(score)
+    better = score[best] > s.score
+    search = s._replace(
+        T=jnp.where(better, T[best], s.T),
+        score=jnp.maximum(score[best], s.score),
+        settled=better & _is_settled(graph, odds, T[best], scale),
+        key=key,
+    )
+    return _Found(
+        search,
+        jnp.concatenate([found.starts, T]),
+        jnp.concatenate([found.odds, odds]),
+        jnp.where(better, odds[best], found.own),
+    )
 
 
 class _Search(NamedTuple):
@@ -204,16 +231,16 @@ def _shortest(graph: PoseGraph, odds: Array) -> Array:
     """Poses along the most probable path from frame 0 to each frame, coarsest odds."""
     doubt = jnp.clip(jax.nn.softplus(-odds[0]), 0.01, 10)  # -log of the belief
     weight = jnp.where(graph.weight > 0, 1 / doubt, 0)
-    return trees.shortest_path_poses(graph.edges, graph.T_i_j, weight, graph.num_poses)[
-        0
-    ]
+    return trees.shortest_paths(
+        graph.edges, graph.T_i_j, weight, graph.num_poses
+    ).T_root_i
 
 
 def _without_cycles(graph: PoseGraph) -> Array:
     heaviest, scale = _heaviest(graph), length_scale(graph)
-    paths = trees.shortest_path_poses(
+    paths = trees.shortest_paths(
         graph.edges, graph.T_i_j, graph.weight, graph.num_poses
-    )[0]
+    ).T_root_i
     better = agreement(graph, paths, scale) >= agreement(graph, heaviest, scale)
     return jnp.where(better, paths, heaviest)
 

@@ -11,6 +11,7 @@ from jaxreg.averaging.laplacian import divergence, laplacian
 from jaxreg.averaging.scales import gaussian_trust
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.trees import ancestors
 
 
 # Motions tried for each group.
@@ -119,16 +120,11 @@ def _subtrees(graph: PoseGraph, in_tree: Array) -> Bool[Array, "v v"]:
 
     far = jnp.full((num,), num, jnp.int32).at[0].set(0)
     hops = jax.lax.while_loop(lambda s: s[1], relax, (far, jnp.asarray(True)))[0]
-    frames = jnp.arange(num)
     parent = jnp.zeros((num,), jnp.int32)
     parent = parent.at[jnp.where(hops[i] < hops[j], j, i)].set(
         jnp.where(hops[i] < hops[j], i, j)
     )
-    parent = parent.at[0].set(0)
-    above = frames[:, None] == frames  # (f, ancestor)
-    for _ in range(max(num - 1, 1).bit_length()):
-        above, parent = above | above[parent], parent[parent]
-    return above.T
+    return ancestors(parent.at[0].set(0)).T
 
 
 def frames_moved(

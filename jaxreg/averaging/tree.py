@@ -44,7 +44,7 @@ class SpanningTree(AbstractAverager):
         args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
         if self.by == "weight":
             return solution(graph, trees.maximum_spanning_tree(*args).T_world_i)
-        return solution(graph, trees.shortest_path_poses(*args)[0])
+        return solution(graph, trees.shortest_paths(*args).T_root_i)
 
 
 def along_frames(graph: PoseGraph) -> Float[Array, "v D D"]:

@@ -2,7 +2,7 @@
 
 All functions take `edges` and a weight per edge; edges of weight 0 (or NaN) are
 absent. Every loop takes O(e) work a round; the rounds are logarithmic in the number of
-frames, except for `shortest_path_poses`, whose rounds are the hops of its longest path.
+frames, except for `shortest_paths`, whose rounds are the hops of its longest path.
 
 Gradients: none; inputs are cut (the topology is not differentiable, and the poses of
 a tree serve as a start).
@@ -158,21 +158,35 @@ def follow(
     return jax.lax.while_loop(unfinished, jump, (parent, T_parent_i))
 
 
-def shortest_path_poses(
+class Paths(eqx.Module):
+    """A tree of shortest paths from one frame, the root.
+
+    Attributes:
+        T_root_i: `(v, d+1, d+1)` with the identity at frames that no path reaches.
+        reached: `(v,)` True for the frames reached.
+        parent: `(v,)` int32 the frame before, the frame itself at the root and where
+            none is.
+        via: `(v,)` int32 the edge from there, e where none is.
+    """
+
+    T_root_i: Float[Array, "v D D"]
+    reached: Bool[Array, " v"]
+    parent: Int[Array, " v"]
+    via: Int[Array, " v"]
+
+
+def shortest_paths(
     edges: Int[Array, "e 2"],
     T_i_j: Float[Array, "e D D"],
     weight: Float[Array, " e"],
     num_poses: int,
-) -> tuple[Float[Array, "v D D"], Bool[Array, " v"]]:
-    """Poses along the paths from frame 0 of least total 1 / weight.
+    root: Int[Array, ""] | int = 0,
+) -> Paths:
+    """The paths from a frame of least total 1 / weight.
 
     If weights are inverse variances, every frame gets the chain of least variance;
     if they are all equal, this is a breadth-first tree (Bellman and Ford, in parallel).
     Weights below a thousandth of the largest count as a thousandth.
-
-    Returns:
-        `T_world_i`, with the identity at frame 0 and at frames that no path reaches,
-        and `(v,)` True for the frames reached.
     """
     edges, T_i_j, weight = jax.lax.stop_gradient((edges, T_i_j, weight))
     i, j = edges[:, 0], edges[:, 1]
@@ -187,7 +201,7 @@ def shortest_path_poses(
         new = reach.at[j].min(reach[i] + length).at[i].min(reach[j] + length)
         return new, jnp.any(new < reach)
 
-    start = jnp.full((num_poses,), jnp.inf, T_i_j.dtype).at[0].set(0)
+    start = jnp.full((num_poses,), jnp.inf, T_i_j.dtype).at[root].set(0)
     reach, _ = jax.lax.while_loop(lambda s: s[1], relax, (start, jnp.asarray(True)))
     reached = jnp.isfinite(reach)
     # The parent is the best neighbour that is strictly nearer: no cycles by rounding.
@@ -210,4 +224,14 @@ def shortest_path_poses(
     eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
     T_parent = jnp.where(backward[:, None, None], lie.inverse(T_i_j[e]), T_i_j[e])
     T_parent = jnp.where(has[:, None, None], T_parent, eye)
-    return follow(parent, T_parent)[1], reached
+    via = jnp.where(has, e, num_edges)
+    return Paths(follow(parent, T_parent)[1], reached, parent, via)
+
+
+def ancestors(parent: Int[Array, " v"]) -> Bool[Array, "v v"]:
+    """Row i: frame i and those above it; a root is its own parent."""
+    num = parent.shape[0]
+    above = jnp.eye(num, dtype=bool)
+    for _ in range(max(num - 1, 1).bit_length()):
+        above, parent = above | above[parent], parent[parent]
+    return above

@@ -103,8 +103,10 @@ def test_methods_are_interleaved():
 
 
 def test_fewer_than_five_calls_are_refused():
-    with pytest.raises(ValueError, match="five calls"):
+    with pytest.raises(ValueError, match="fewer than 5 calls"):
         Case("few", "", [], [()] * 4, lambda _: Judged([]))
+    with pytest.raises(ValueError, match="fewer than 3 calls"):
+        Case("few", "", [], [()] * 2, lambda _: Judged([]), long=True)
 
 
 def test_memory_of_a_call_is_about_what_it_holds():

@@ -11,7 +11,7 @@ from jaxreg.graph import trees
 
 V, E = 12, 30
 maximum = jax.jit(trees.maximum_spanning_tree, static_argnums=3)
-shortest = jax.jit(trees.shortest_path_poses, static_argnums=3)
+shortest = jax.jit(trees.shortest_paths, static_argnums=3)
 components = jax.jit(trees.components, static_argnums=2)
 
 
@@ -72,11 +72,22 @@ def test_forest_is_that_of_scipy_and_poses_are_exact(seed, present):
 @given(st.integers(0, 10**6), st.sampled_from([0.2, 0.5, 1.0]))
 def test_shortest_paths_reach_what_is_connected_exactly(seed, present):
     X, edges, T, weight = random_case(seed, present)
-    poses, reached = shortest(edges, T, weight, V)
+    paths = shortest(edges, T, weight, V, seed % V)
+    root = seed % V
     labels = scipy_components(edges, weight)
-    np.testing.assert_array_equal(reached, labels == labels[0])
-    expected = np.where((labels == labels[0])[:, None, None], X, np.eye(4))
-    np.testing.assert_allclose(poses, expected, atol=2e-5)
+    reached = labels == labels[root]
+    np.testing.assert_array_equal(paths.reached, reached)
+    T_root_i = np.linalg.inv(X[root]) @ X
+    expected = np.where(reached[:, None, None], T_root_i, np.eye(4))
+    np.testing.assert_allclose(paths.T_root_i, expected, atol=2e-5)
+    # Each frame but the root comes by an edge from its parent.
+    inner = reached & (np.arange(V) != root)
+    ends = np.sort(edges[np.asarray(paths.via)[inner]], axis=1)
+    steps = np.stack([np.flatnonzero(inner), np.asarray(paths.parent)[inner]], axis=1)
+    np.testing.assert_array_equal(ends, np.sort(steps, axis=1))
+    np.testing.assert_array_equal(paths.via == E, ~inner)
+    above = np.asarray(trees.ancestors(paths.parent))
+    np.testing.assert_array_equal(above[reached, root], True)
 
 
 def test_paths_are_those_of_least_variance():
@@ -86,9 +97,9 @@ def test_paths_are_those_of_least_variance():
     edges = jnp.array([[0, 1], [1, 2], [0, 2]], jnp.int32)
     for direct, expected in ((3.0, 2.0), (1.5, 10.0)):
         weight = np.array([1, 1, 1 / direct], np.float32)
-        poses, _ = trees.shortest_path_poses(
+        poses = trees.shortest_paths(
             edges, jnp.asarray(T), jnp.asarray(weight), 3
-        )
+        ).T_root_i
         np.testing.assert_allclose(poses[2, 0, 3], expected)
 
 
@@ -114,4 +125,4 @@ def test_batches_and_long_chains():
     poses = maximum(chain, steps, ones, num).T_world_i
     np.testing.assert_array_equal(poses[:, 0, 3], np.arange(num))
     np.testing.assert_array_equal(components(chain, ones, num), 0)
-    np.testing.assert_array_equal(shortest(chain, steps, ones, num)[0], poses)
+    np.testing.assert_array_equal(shortest(chain, steps, ones, num).T_root_i, poses)
