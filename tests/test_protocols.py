@@ -151,16 +151,15 @@ def test_registration_in_any_transformation(name):
 
 
 def _check_trace(solve, row, problem):
-    """The solution of a batch, in the plane and single precision, and its gradient."""
-    batch = [jax.ShapeDtypeStruct((7, *x.shape), np.float32) for x in problem]
+    """In the plane and single precision: the solution; of a batch, its gradient."""
     with jax.check_tracer_leaks():
-        _, solution = jax.eval_shape(jax.vmap(solve), *batch)
+        solution = jax.eval_shape(lambda *args: solve(*args)[1], *problem)
     if not row.runs:
+        batch = [jax.ShapeDtypeStruct((7, *x.shape), np.float32) for x in problem]
         slope = jax.vmap(jax.grad(lambda *args: jnp.sum(solve(*args)[0]), (0, 1)))
         found = jax.eval_shape(slope, *batch)
         assert [x.shape for x in found] == [x.shape for x in batch]
     assert _dtypes(solution) == SINGLE
-    assert {x.shape[0] for x in jax.tree.leaves(solution)} == {7}
 
 
 @pytest.mark.parametrize("name", REGISTRARS)
