@@ -74,10 +74,11 @@ class ICP(AbstractRegistrar):
     (the scores are those of the end).
 
     Gradients: with respect to both clouds and `width_end`, exact by the implicit
-    function theorem where the loop has converged, in forward and reverse mode;
-    correspondences, normals, the sample spacing, and a width that follows the residuals
-    are held, directions that are free do not move, and nothing flows to `init`. With
-    `RecursiveCheckpointAdjoint()` through the steps, also to `init`, in reverse mode.
+    function theorem where the loop has converged, in forward and reverse mode.
+    Correspondences, the sample spacing, and a width that follows the residuals are
+    held; normals turn with their cloud as a whole; directions that are free do not
+    move, and nothing flows to `init`. With `RecursiveCheckpointAdjoint()` through the
+    steps, also to `init`, in reverse mode.
     """
 
     # Discs ten times thicker than GICP's reach the solution from farther away, with

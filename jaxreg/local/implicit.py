@@ -77,6 +77,42 @@ def _correction_jvp(primals: tuple[_End], tangents: tuple) -> tuple[Array, Array
     return zero, -full_matmul(Vt.T, share[:, None])[:, 0]
 
 
+def _with_turning_normals(problem: Problem) -> Problem:
+    """Normals that turn with their cloud as a whole, each held within it.
+
+    So the pose follows a rigid motion of either cloud exactly.
+    """
+    d = problem.source.shape[0]
+    source = _turned(problem.source, problem.source_normals)
+    points, normals = problem.target[:, :d].T, problem.target[:, d:].T
+    target = jnp.concatenate([points, _turned(points, normals)]).T
+    return eqx.tree_at(
+        lambda p: (p.source_normals, p.target), problem, (source, target)
+    )
+
+
+def _turned(
+    points: Float[Array, "d n"], normals: Float[Array, "d n"]
+) -> Float[Array, "d n"]:
+    """The same normals, with the derivative of the rotation that fits the points'.
+
+    Its tangent W is skew and least in sum |dx - W x|^2: W C + C W = B - B^T with
+    C = sum x x^T and B = sum dx x^T.
+    """
+    still = jax.lax.stop_gradient(points)
+    known = jnp.any(normals != 0, axis=0).astype(points.dtype)
+    middle = jnp.sum(known * still, axis=1) / jnp.maximum(jnp.sum(known), 1)
+    x = known * (still - middle[:, None])
+    B = full_matmul(points - still, x.T)
+    spread, axes = jnp.linalg.eigh(full_matmul(x, x.T))
+    skew = full_matmul(axes.T, full_matmul(B - B.T, axes))
+    total = spread[:, None] + spread[None, :]
+    floor = _FREE * jnp.finfo(spread.dtype).eps * spread[-1]
+    skew = jnp.where(total > floor, skew / jnp.where(total > floor, total, 1), 0)
+    turn = full_matmul(axes, full_matmul(skew, axes.T))
+    return normals + full_matmul(turn, normals)
+
+
 def _pulls(x: Float[Array, " k"], at: _End) -> Float[Array, " k"]:
     """b, and the pull on the scale if that is free, at a tangent from the end."""
     d = at.problem.source.shape[0]
@@ -84,7 +120,7 @@ def _pulls(x: Float[Array, " k"], at: _End) -> Float[Array, " k"]:
     scale = at.found.scale
     if at.limits.with_scale:
         scale = scale * jnp.exp(x[-1])
-    found = match(at.problem.scaled(scale), T, at.found.row)
+    found = match(_with_turning_normals(at.problem).scaled(scale), T, at.found.row)
     found = at.limits.within_reach(found)
     weight = at.optimiser.weights(found, at.width)
     residual = at.optimiser.residual
