@@ -177,7 +177,7 @@ def _prospects(
     """Present poses, and the share of scan j that is near scan i by them, i < j."""
     min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
     found = place(motions, scans.num_scans, averaging, min_overlap)
-    T, spacing = found.T_world_i, _DRIFT * jnp.max(scans.spacing)
+    T, spacing = found.T_world_i, _DRIFT * scans.coarsest
 
     def share(pair: Array) -> Array:
         i, j = pair

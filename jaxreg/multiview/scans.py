@@ -53,6 +53,11 @@ class PreparedScans(eqx.Module):
         """Which scans can be registered."""
         return self.fault == Status.CONVERGED
 
+    @property
+    def coarsest(self) -> Scalar:
+        """The largest spacing of the scans that can be registered."""
+        return jnp.max(jnp.where(self.usable, self.spacing, 0))
+
     def cloud(self, i: Int[Array, ""]) -> PointCloud:
         """One scan's thinned points."""
         return jax.tree.map(lambda x: x[i], self.clouds)

@@ -46,14 +46,13 @@ def _grips(
 ) -> Grip:
     """Of every pair that overlaps, in the world's frame; nothing of the others."""
     T_world_i = placement.T_world_i
-    spacing = jnp.max(scans.spacing)
 
     def one(pair: Array) -> Grip:
         i, j = pair
         T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
         problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
         found = match(problem, T_i_j)
-        share = agreeing(found, spacing)
+        share = agreeing(found, scans.coarsest)
         enough = jnp.sum(share) >= min_overlap * jnp.sum(found.mask)
         use = enough & placement.together(i, j)
         points = found.rotated + lie.translation(T_i_j)[:, None]
