@@ -208,7 +208,7 @@ class _Centroids(AbstractRegistrar):
             b=H[0],
             error=zero,
             covariance=H,
-            modes=Modes.alone(T, zero, H),
+            modes=Modes.alone(T, zero, zero, zero, H),
         )
 
 

@@ -148,19 +148,20 @@ class KernelCorrelation(AbstractRegistrar):
             target.mask, dtype=dtype
         )
         covariance = _covariance(held, end.T_target_source, *fixed[:2], fixed[3])
+        overlap, rmse = mutual_overlap(there, back), there.inlier_rmse
         return RegistrationSolution(
             T_target_source=T,
             status=status.astype(jnp.int32),
             fitness=there.fitness,
-            inlier_rmse=there.inlier_rmse,
+            inlier_rmse=rmse,
             num_inliers=there.num_inliers,
-            overlap=mutual_overlap(there, back),
+            overlap=overlap,
             num_steps=end.num_steps,
             H=held.H,
             b=held.b,
             error=fixed[3] ** 2 * (num_pairs - held.correlation),
             covariance=covariance,
-            modes=Modes.alone(T, there.fitness, covariance),
+            modes=Modes.alone(T, there.fitness, overlap, rmse, covariance),
         )
 
     def width(self, spacing: Float[Array, ""]) -> Float[Array, ""]:

@@ -16,11 +16,11 @@ from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 
 
-_FORMAT = "jaxreg pairs 1"
+_FORMAT = "jaxreg pairs 2"
 
 
 class Pairs(NamedTuple):
-    """Relative motions: `(e, 2)` ids, `(e, d+1, d+1)`, `(e,)` and `(e,)`."""
+    """The modes of pairs: `(e, 2)` ids, `(e, m, d+1, d+1)`, `(e, m)` and `(e, m)`."""
 
     edges: np.ndarray
     T_i_j: np.ndarray
@@ -74,8 +74,8 @@ class PairLog:
                 {
                     "pair": found.edges[e].tolist(),
                     "T_i_j": found.T_i_j[e].tolist(),
-                    "overlap": float(found.overlap[e]),
-                    "inlier_rmse": float(found.inlier_rmse[e]),
+                    "overlap": found.overlap[e].tolist(),
+                    "inlier_rmse": found.inlier_rmse[e].tolist(),
                 }
             )
             for e in range(len(found.edges))

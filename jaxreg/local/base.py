@@ -23,13 +23,17 @@ class Modes(BriefModule):
     Attributes:
         T_target_source: `(q, d+1, d+1)`.
         weight: `(q,)` share of the posterior; zero marks an unused row.
-        fitness: `(q,)` as in the solution.
+        fitness: `(q,)` as in the solution, as the next three.
+        overlap: `(q,)`; zero of unused rows.
+        inlier_rmse: `(q,)`.
         covariance: `(q, k, k)` of each, as in the solution.
     """
 
     T_target_source: Float[Array, "*b q D D"]
     weight: Float[Array, "*b q"]
     fitness: Float[Array, "*b q"]
+    overlap: Float[Array, "*b q"]
+    inlier_rmse: Float[Array, "*b q"]
     covariance: Float[Array, "*b q k k"]
 
     @classmethod
@@ -37,11 +41,14 @@ class Modes(BriefModule):
         cls,
         T_target_source: Motion,
         fitness: Float[Array, ""],
+        overlap: Float[Array, ""],
+        inlier_rmse: Float[Array, ""],
         covariance: Float[Array, "k k"],
     ) -> "Modes":
         """One pose with all the weight."""
-        one = jnp.ones(1, fitness.dtype)
-        return cls(T_target_source[None], one, fitness[None], covariance[None])
+        weight = jnp.ones_like(fitness)
+        alone = T_target_source, weight, fitness, overlap, inlier_rmse, covariance
+        return cls(*(x[None] for x in alone))
 
     @property
     def margin(self) -> Float[Array, "*b"]:

@@ -160,19 +160,21 @@ class ICP(AbstractRegistrar):
         curvature = Curvature.of(
             optimiser, problem.scaled(scale), end.T_matched, found, end.width
         )
+        overlap, rmse = mutual_overlap(there, back), there.inlier_rmse
+        modes = Modes.alone(T, there.fitness, overlap, rmse, curvature.covariance)
         return RegistrationSolution(
             T_target_source=T,
             status=status.astype(jnp.int32),
             fitness=there.fitness,
-            inlier_rmse=there.inlier_rmse,
+            inlier_rmse=rmse,
             num_inliers=there.num_inliers,
-            overlap=mutual_overlap(there, back),
+            overlap=overlap,
             num_steps=end.num_steps,
             H=curvature.H,
             b=curvature.b,
             error=curvature.error,
             covariance=curvature.covariance,
-            modes=Modes.alone(T, there.fitness, curvature.covariance),
+            modes=modes,
         )
 
     @property

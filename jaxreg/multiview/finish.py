@@ -1,7 +1,7 @@
 """From the motions of pairs to the answer: poses, statuses, trust."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.compile import compiled
 from jaxreg._core.status import Status
@@ -10,7 +10,7 @@ from jaxreg.averaging import AbstractAverager
 from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
 from jaxreg.multiview.hold import Held
-from jaxreg.multiview.place import Placement, place
+from jaxreg.multiview.place import Placement, displacement, place
 from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative import RelativeMotions
 from jaxreg.multiview.scans import PreparedScans
@@ -37,13 +37,14 @@ def finish(
     """
     min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
     placement = place(motions, scans.num_scans, averaging, min_overlap)
+    mode = placement.mode
     placement = refine(scans, placement, averaging, min_overlap / 2)
     if hold is None:
         slips = slipping(scans, placement, min_overlap)
-        return _solution(scans, motions, placement, slips, min_overlap)
+        return _solution(scans, motions, mode, placement, slips, min_overlap)
     placement = hold.place(scans, placement, averaging, min_overlap / 2)
     slips = slipping(scans, placement, min_overlap) & ~hold.held
-    solution = _solution(scans, motions, placement, slips, min_overlap)
+    solution = _solution(scans, motions, mode, placement, slips, min_overlap)
     return hold.in_world(solution)
 
 
@@ -51,15 +52,18 @@ def finish(
 def _solution(
     scans: PreparedScans,
     motions: RelativeMotions,
+    mode: Int[Array, " e"],
     placement: Placement,
     slips: Bool[Array, " v"],
     min_overlap: Scalar,
 ) -> ReconstructionSolution:
     """In the frames and unit of the input."""
-    weight = jnp.where(motions.overlap >= min_overlap, motions.overlap, 0)
     found = motions.in_input_frames(scans)
+    one = found.of_modes(mode)
+    overlap, T_i_j = one.overlap[:, 0], one.T_i_j[:, 0]
+    weight = jnp.where(overlap >= min_overlap, overlap, 0)
     real = motions.pairs[:, 0] != motions.pairs[:, 1]
-    graph = PoseGraph(found.pairs, found.T_i_j, weight, real, None, scans.num_scans)
+    graph = PoseGraph(found.pairs, T_i_j, weight, real, None, scans.num_scans)
     component, placed = placement.component, placement.placed
     scan_status = jnp.where(component < 0, Status.LOW_OVERLAP, Status.DISCONNECTED)
     scan_status = jnp.where(placed, Status.CONVERGED, scan_status)
@@ -74,9 +78,11 @@ def _solution(
         placed=placed,
         component=component,
         graph=graph,
-        overlap=motions.overlap,
-        edge_weight=_trust(scans, motions, placement, weight),
-        inlier_rmse=found.inlier_rmse,
+        overlap=overlap,
+        edge_weight=_trust(scans, motions.of_modes(mode), placement, weight),
+        inlier_rmse=one.inlier_rmse[:, 0],
+        mode=mode,
+        motions=found,
         num_dropped=scans.num_dropped,
     )
 
@@ -87,14 +93,12 @@ def _trust(
     placement: Placement,
     weight: Float[Array, " e"],
 ) -> Float[Array, " e"]:
-    """Agreement of the pairs' motions with the poses; the centred radius is one."""
+    """Agreement of one motion of each pair with the poses; the radius is one."""
     i, j = motions.pairs[:, 0], motions.pairs[:, 1]
     T_world_i = placement.T_world_i
-    T_error = lie.inverse(T_world_i[i]) @ T_world_i[j] @ lie.inverse(motions.T_i_j)
-    turn = lie.rotation_angle(lie.rotation(T_error))
-    centre = lie.translation(lie.inverse(T_world_i[i]) @ T_world_i[j])
-    shift = centre - lie.translation(motions.T_i_j)
-    sq = turn**2 + jnp.sum(shift**2, axis=-1)
+    T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
+    turn, shift = displacement(T_i_j, motions.T_i_j[:, 0])
+    sq = turn**2 + shift**2
     spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
     trust = jnp.exp(-sq / (2 * jnp.maximum(spacing, 1e-6) ** 2))
     return jnp.where((weight > 0) & placement.together(i, j), trust, 0)

@@ -40,7 +40,7 @@ def descended(
     pairs: Int[Array, "e 2"],
     T_i_j: Float[Array, "e D D"],
 ) -> RelativeMotions:
-    """Motions by descents from guesses, in the scans' centred frames."""
+    """Motions by descents from guesses, in the scans' centred frames, m = 1."""
     widest, dtype = method.width_start, T_i_j.dtype
     coarse = LocalOptimiser(method.residual, method.kernel, method.step)
     fine = LocalOptimiser(PlaneToPlane(0.01), method.kernel, GaussNewton())
@@ -58,9 +58,9 @@ def descended(
         sound = scans.usable[i] & scans.usable[j] & jnp.all(jnp.isfinite(T))
         return RelativeMotions(
             row[0],
-            jnp.where(sound, lie.orthonormalise(T), jnp.eye(len(T), dtype=dtype)),
-            jnp.where(sound, mutual_overlap(there, back)[0], 0),
-            there.inlier_rmse[0],
+            jnp.where(sound, lie.orthonormalise(T), jnp.eye(len(T), dtype=dtype))[None],
+            jnp.where(sound, mutual_overlap(there, back), 0),
+            there.inlier_rmse,
         )
 
     return lax.map(one, (pairs, T_i_j))

@@ -112,8 +112,8 @@ def _contracted(
     within = hold.held[i] & hold.held[j]
     return RelativeMotions(
         hold.node[motions.pairs],
-        T[i] @ motions.T_i_j @ lie.inverse(T[j]),
-        jnp.where(within, 0, motions.overlap),
+        T[i][:, None] @ motions.T_i_j @ lie.inverse(T[j])[:, None],
+        jnp.where(within[:, None], 0, motions.overlap),
         motions.inlier_rmse,
     )
 

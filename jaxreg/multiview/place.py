@@ -1,7 +1,9 @@
 """From relative motions to poses: which pairs to trust, and which scans they place."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.compile import compiled
@@ -12,6 +14,7 @@ from jaxreg.averaging import (
     SpanningTree,
     average,
 )
+from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import components
 from jaxreg.multiview.relative import RelativeMotions
@@ -19,6 +22,11 @@ from jaxreg.multiview.relative import RelativeMotions
 
 # An edge whose residual leaves it less trust than this joins no scans.
 _MIN_TRUST = 0.1
+# A mode agrees with poses within this, in radians and radii: half of what two modes of
+# a pair are apart.
+_AGREES = 0.15
+# Averages: of the best modes, then of those that agree with the poses from these.
+_PASSES = 2
 # Pairs of overlap above this many times the least one join scans on their own; weaker
 # ones must be confirmed by a second pair between the same parts.
 _STRONG = 2.0
@@ -32,12 +40,14 @@ class Placement(eqx.Module):
         part: `(v,)` int32, the lowest number of the scans that each hangs together
             with, of a scan alone its own.
         edge_weight: `(e,)` trust in each pair.
+        mode: `(e,)` int32, which of each pair's modes was averaged.
         status: of the averaging.
     """
 
     T_world_i: Float[Array, "v D D"]
     part: Int[Array, " v"]
     edge_weight: Float[Array, " e"]
+    mode: Int[Array, " e"]
     status: StatusArray
 
     @property
@@ -74,6 +84,10 @@ def place(
 ) -> Placement:
     """Averages the pairs that overlap; the world is the frame of the root.
 
+    Each pair is a mixture of its modes, of which one at a time counts: the best, and
+    once poses are known, the one that agrees with them, with its own overlap (a
+    max-mixture, as of Olson and Agarwal 2013).
+
     The root is the scan of lowest number in the largest connected set of scans. The
     other sets of two and more are averaged with it, each hung on it by one motion of no
     consequence. Overlap is evidence of its own, so averaging starts from the spanning
@@ -81,8 +95,29 @@ def place(
     """
     if averaging is None:
         averaging = Correntropy(initialiser=SpanningTree())
-    pairs = motions.pairs
-    trusted = jnp.where(motions.overlap >= min_overlap, motions.overlap, 0)
+    best = jnp.zeros(len(motions.pairs), jnp.int32)
+    if motions.num_modes == 1:
+        return _averaged(motions, best, num_scans, averaging, min_overlap)
+
+    def again(mode: Array, _: None) -> tuple[Array, Placement]:
+        found = _averaged(motions, mode, num_scans, averaging, min_overlap)
+        return _agreeing(motions, found, min_overlap), found
+
+    _, passes = lax.scan(again, best, None, length=_PASSES)
+    return jax.tree.map(lambda x: x[-1], passes)
+
+
+def _averaged(
+    motions: RelativeMotions,
+    mode: Int[Array, " e"],
+    num_scans: int,
+    averaging: AbstractAverager,
+    min_overlap: Scalar,
+) -> Placement:
+    """By one mode of each pair."""
+    pairs, one = motions.pairs, motions.of_modes(mode)
+    T_i_j, overlap = one.T_i_j[:, 0], one.overlap[:, 0]
+    trusted = jnp.where(overlap >= min_overlap, overlap, 0)
     label = components(pairs, trusted, num_scans)
     size = part_sizes(label)
     root = jnp.argmax(size).astype(jnp.int32)
@@ -90,13 +125,35 @@ def place(
     hung = (label == ids) & (size > 1) & (ids != root)
     # Averaging fixes frame 0: swap the root's number with 0.
     swap = ids.at[root].set(0).at[0].set(root)
-    graph = PoseGraph(swap[pairs], motions.T_i_j, trusted, trusted > 0, None, num_scans)
+    graph = PoseGraph(swap[pairs], T_i_j, trusted, trusted > 0, None, num_scans)
     solution = average(_with_hung(graph, hung[swap], min_overlap), averaging)
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
     agreed = jnp.where(believed(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
-    label = _confirmed_components(pairs, agreed, num_scans, _STRONG * min_overlap)
-    return Placement(solution.T_world_i[swap], label, edge_weight, solution.status)
+    part = _confirmed_components(pairs, agreed, num_scans, _STRONG * min_overlap)
+    T_world_i = solution.T_world_i[swap]
+    return Placement(T_world_i, part, edge_weight, mode, solution.status)
+
+
+def _agreeing(
+    motions: RelativeMotions, found: Placement, min_overlap: Scalar
+) -> Int[Array, " e"]:
+    """The first of each pair's modes that agrees with the poses; if none, the best."""
+    i, j = motions.pairs.T
+    T_i_j = lie.inverse(found.T_world_i[i]) @ found.T_world_i[j]
+    turn, shift = displacement(T_i_j[:, None], motions.T_i_j)
+    agrees = (turn < _AGREES) & (shift < _AGREES) & (motions.overlap >= min_overlap)
+    agrees = agrees & found.together(i, j)[:, None]
+    return jnp.argmax(agrees, axis=1).astype(jnp.int32)
+
+
+def displacement(
+    T_a_b: Float[Array, "... D D"], T_other: Float[Array, "... D D"]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """How far two motions take a centred scan apart: angle, distance of its centre."""
+    R = jnp.einsum("...ij,...kj->...ik", lie.rotation(T_a_b), lie.rotation(T_other))
+    shift = lie.translation(T_a_b) - lie.translation(T_other)
+    return lie.rotation_angle(R), jnp.sqrt(jnp.sum(shift**2, axis=-1))
 
 
 def part_sizes(part: Int[Array, " v"]) -> Int[Array, " v"]:

@@ -95,7 +95,7 @@ def _updated(before: Placement, after: Placement) -> Placement:
 def measured(
     scans: PreparedScans, placement: Placement, min_overlap: Scalar, *, exact: bool
 ) -> RelativeMotions:
-    """The motion and overlap of every pair of a part near the present poses."""
+    """The motion and overlap of every pair of a part near the present poses, m = 1."""
     T_world_i, alone = placement.T_world_i, part_sizes(placement.part) == 1
     spacing = jnp.max(jnp.where(alone, 0, scans.spacing))
     widths = spacing * jnp.asarray(_EXACT_WIDTHS if exact else _TABLE_WIDTHS)
@@ -120,6 +120,7 @@ def measured(
 
     pairs = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
     T_i_j, overlap = lax.map(one, pairs)
+    T_i_j, overlap = T_i_j[:, None], overlap[:, None]
     return RelativeMotions(pairs, T_i_j, overlap, jnp.zeros_like(overlap))
 
 

@@ -17,7 +17,7 @@ from jaxreg.local import Problem, score
 from jaxreg.multiview.follow import SURE, descended_in_input_frames
 from jaxreg.multiview.place import Placement, believed, place
 from jaxreg.multiview.plan import Order, first_pairs, most_pairs, next_pairs
-from jaxreg.multiview.relative import RelativeMotions, relative_motions
+from jaxreg.multiview.relative import RelativeMotions, num_kept, relative_motions
 from jaxreg.multiview.scans import PreparedScans
 from jaxreg.particle import ParticleFilter
 
@@ -56,6 +56,7 @@ class Rounds:
         self.key, self.on_pairs, self.report = key, on_pairs, report
         self.known, self.row = known, {}
         if known is not None:
+            self.known = known.with_modes(num_kept(method))
             ids = map(tuple, np.asarray(known.pairs).tolist())
             self.row = {pair: row for row, pair in enumerate(ids)}
         self.tried = np.zeros((scans.num_scans,) * 2, bool)
@@ -143,15 +144,15 @@ class Rounds:
             if guess is None:
                 continue
             one = descended_in_input_frames(self.method, scans, (i, j), guess)
-            if float(one.overlap[0]) < SURE:
+            if float(one.overlap[0, 0]) < SURE:
                 self.rivals[i, j] = one
                 continue
             # Known pairs are followed, too: a run taken up again goes the same way.
             if (i, j) not in self.row:
                 self._tell(one)
                 self.row[i, j] = sum(len(x.overlap) for x in found)
-                found.append(one)
-            step = sure[i, j] = np.asarray(one.in_input_frames(scans).T_i_j[0])
+                found.append(one.with_modes(num_kept(self.method)))
+            step = sure[i, j] = np.asarray(one.in_input_frames(scans).T_i_j[0, 0])
         self.report("following the sequence", len(gaps), len(gaps))
         if found:
             self.known = jax.tree.map(lambda *x: jnp.concatenate(x), *found)

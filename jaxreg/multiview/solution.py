@@ -31,6 +31,7 @@ class ReconstructionSolution(Solution):
             the component of most scans, -1 stands for scans alone. Nothing is known
             of how two components lie.
         graph: every pair that was registered, `T_i_j` in the input's frames and unit,
+            of the mode that agrees with the other pairs, of the best mode if none does;
             prior weight the overlap where it is trusted and else 0.
         overlap: `(e,)` see `RegistrationSolution`.
         edge_weight: `(e,)` trust, 0 to 1: how well the pair's own motion agrees with
@@ -38,6 +39,8 @@ class ReconstructionSolution(Solution):
             is the sample spacing; 0 where the overlap is too small or the scans are
             of two components.
         inlier_rmse: `(e,)` distance of that share, in the unit of the input.
+        mode: `(e,)` int32, which of the pair's modes that is, 0 the best.
+        motions: every mode of every pair, in the input's frames and unit.
         num_dropped: `(v,)` rows that were not finite.
     """
 
@@ -50,14 +53,9 @@ class ReconstructionSolution(Solution):
     overlap: Float[Array, " e"]
     edge_weight: Float[Array, " e"]
     inlier_rmse: Float[Array, " e"]
+    mode: Int[Array, " e"]
+    motions: RelativeMotions
     num_dropped: Int[Array, " v"]
-
-    @property
-    def motions(self) -> RelativeMotions:
-        """The pairs as they were registered, in the input's frames and unit."""
-        return RelativeMotions(
-            self.graph.edges, self.graph.T_i_j, self.overlap, self.inlier_rmse
-        )
 
     @property
     def num_scans(self) -> int:
@@ -70,7 +68,8 @@ class ReconstructionSolution(Solution):
         def pairs_of(s: ReconstructionSolution) -> tuple[object, ...]:
             g = s.graph
             of_graph = g.edges, g.T_i_j, g.weight, g.mask
-            return *of_graph, s.overlap, s.edge_weight, s.inlier_rmse
+            of_pairs = s.overlap, s.edge_weight, s.inlier_rmse, s.mode
+            return *of_graph, *of_pairs, s.motions
 
         parts = jax.tree.map(lambda x: x[:num], pairs_of(self))
         return eqx.tree_at(pairs_of, self, parts)

@@ -147,7 +147,14 @@ def conclude(
         b=curvature.b,
         error=curvature.error,
         covariance=curvature.covariance,
-        modes=Modes(T_modes, mass, there.fitness, curvatures.covariance),
+        modes=Modes(
+            T_modes,
+            mass,
+            there.fitness,
+            jnp.maximum(overlap, 0),
+            there.inlier_rmse,
+            curvatures.covariance,
+        ),
     )
 
 

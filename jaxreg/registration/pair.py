@@ -124,6 +124,8 @@ class _Frames(eqx.Module):
                 jax.vmap(back)(modes.T_target_source),
                 modes.weight,
                 modes.fitness,
+                modes.overlap,
+                self.radius * modes.inlier_rmse,
                 modes.covariance * jnp.outer(unit, unit),
             ),
         )

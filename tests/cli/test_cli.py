@@ -450,7 +450,10 @@ def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
 ):
     scans = _save_scans(folder)
     found = jaxreg.RelativeMotions(
-        jnp.array([[0, 1]]), jnp.eye(4)[None], jnp.array([0.7]), jnp.array([0.01])
+        jnp.array([[0, 1]]),
+        jnp.eye(4)[None, None],
+        jnp.array([[0.7]]),
+        jnp.array([[0.01]]),
     )
 
     def stopped(*_: Any, on_pairs: Any, **__: Any) -> None:

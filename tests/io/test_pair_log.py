@@ -14,9 +14,10 @@ RUN = {"seed": 0, "version": "1"}
 
 def _pairs(first: int, num: int) -> Pairs:
     rng = np.random.default_rng(first)
-    T = rng.normal(size=(num, 4, 4)).astype(np.float32)
+    T = rng.normal(size=(num, 2, 4, 4)).astype(np.float32)
     ids = np.arange(first, first + num)
-    return Pairs(np.stack([ids, ids + 1], 1), T, rng.random(num), rng.random(num))
+    shape = num, 2
+    return Pairs(np.stack([ids, ids + 1], 1), T, rng.random(shape), rng.random(shape))
 
 
 def test_pairs_come_back_to_the_last_bit(tmp_path: Path):

@@ -17,7 +17,7 @@ from jaxreg.multiview.inputs import padded_scans
 FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64, max_points=1024)
 
 MOTIONS = RelativeMotions(
-    jnp.array([[2, 8]]), jnp.eye(4)[None], jnp.ones(1), jnp.ones(1)
+    jnp.array([[2, 8]]), jnp.eye(4)[None, None], jnp.ones((1, 1)), jnp.ones((1, 1))
 )
 
 

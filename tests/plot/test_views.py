@@ -39,12 +39,13 @@ def _registration(status: int = 0) -> jaxreg.RegistrationSolution:
         b=six[0],
         error=one,
         covariance=1e-4 * six,
-        modes=Modes.alone(T, one, 1e-4 * six),
+        modes=Modes.alone(T, one, one, 0.01 * one, 1e-4 * six),
     )
 
 
 def _reconstruction() -> jaxreg.ReconstructionSolution:
     ones = jnp.ones(3)
+    one = 0.5 * ones[:, None], 0.01 * ones[:, None]
     return jaxreg.ReconstructionSolution(
         T_world_i=jnp.asarray(T_WORLD),
         status=jnp.asarray(Status.DISCONNECTED, jnp.int32),
@@ -55,6 +56,8 @@ def _reconstruction() -> jaxreg.ReconstructionSolution:
         overlap=0.5 * ones,
         edge_weight=ones.at[1:].set(0),
         inlier_rmse=0.01 * ones,
+        mode=jnp.zeros(3, jnp.int32),
+        motions=jaxreg.RelativeMotions(GRAPH.edges, GRAPH.T_i_j[:, None], *one),
         num_dropped=jnp.zeros(3, jnp.int32),
     )
 

@@ -1,0 +1,52 @@
+"""From relative motions to poses."""
+
+import jax.numpy as jnp
+import numpy as np
+from helpers import motion, pose_error
+
+from jaxreg.multiview import RelativeMotions
+from jaxreg.multiview.place import place
+from jaxreg.multiview.plan import all_pairs
+
+
+T_TRUE = np.stack([motion(k, 3) for k in range(7)]).astype(np.float32)
+PAIRS = all_pairs(7)
+# A search took a wrong mode for the best of these pairs; of SECOND the right one is the
+# second, of LOST it was not found.
+SECOND, LOST = (2, 6, 9, 14), (4, 17)
+
+
+def _motions(order: list[int]) -> RelativeMotions:
+    i, j = PAIRS.T
+    right = np.linalg.inv(T_TRUE[i]) @ T_TRUE[j]
+    wrong = [[motion(100 + 5 * e + k, 3) for k in range(3)] for e in range(len(PAIRS))]
+    modes = np.concatenate([right[:, None], np.array(wrong, np.float32)], axis=1)
+    overlap = np.tile(np.float32([0.4, 0.2, 0.15, 0]), (len(PAIRS), 1))
+    for e in SECOND:
+        modes[e, :2] = modes[e, 1::-1]
+    modes[list(LOST), 0] = modes[list(LOST), 3]
+    overlap[list(SECOND + LOST), 0] = 0.25
+    arrays = PAIRS, modes, overlap, 0.01 * overlap
+    return RelativeMotions(*(jnp.asarray(x[order]) for x in arrays))
+
+
+def test_a_second_mode_counts_where_it_agrees_with_the_poses():
+    every = list(range(len(PAIRS)))
+    for order in (every, every[::-1]):
+        found = place(_motions(order), 7, None, jnp.float32(0.1))
+        for T, T_true in zip(found.T_world_i, T_TRUE, strict=True):
+            T_expected = np.linalg.inv(T_TRUE[0]) @ T_true
+            angle, shift = pose_error(T, T_expected)
+            assert angle < 1e-3
+            assert shift < 1e-3
+        mode, weight = (np.asarray(x)[order] for x in (found.mode, found.edge_weight))
+        np.testing.assert_array_equal(mode, np.isin(every, SECOND))
+        np.testing.assert_array_equal(weight < 0.1, np.isin(every, LOST))
+        np.testing.assert_array_equal(found.part, 0)
+
+
+def test_without_second_modes_their_pairs_are_not_believed():
+    motions = _motions(list(range(len(PAIRS)))).with_modes(1)
+    found = place(motions, 7, None, jnp.float32(0.1))
+    wrong = np.isin(range(len(PAIRS)), SECOND + LOST)
+    np.testing.assert_array_equal(np.asarray(found.edge_weight) < 0.1, wrong)
