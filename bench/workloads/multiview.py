@@ -13,6 +13,7 @@ from bench.case import Case, Judged, Method, Options, Solve
 from bench.motion_scans import SETS, load_scans
 from bench.peers.multiview import Multiway
 from bench.records import Metric, error
+from bench.surfaces import Surface, surface_distance
 from jaxreg import reconstruct
 from jaxreg.datasets import sculpture_scans
 from jaxreg.io import read_log
@@ -54,7 +55,7 @@ def cases(options: Options) -> Iterator[Case]:
             data=f"{len(data.scans)} scans of {len(data.scans[0])} points",
             methods=[own_method(_own), peer_method(method, method.solve)],
             trials=[(data.scans, seed) for seed in range(5)],
-            judge=partial(judge, data.T_world_i),
+            judge=partial(_judged, data),
             reference=PEER,
         )
 
@@ -103,6 +104,20 @@ def _own(scans: list[np.ndarray], seed: int) -> np.ndarray:
     found = reconstruct(scans, key=jax.random.key(seed))
     placed = np.asarray(found.placed)[:, None, None]
     return np.where(placed, np.asarray(found.T_world_i), np.nan)
+
+
+def _judged(data: Scans, answers: list[Any]) -> Judged:
+    """Errors, and how the surfaces meet at the answers and at the published poses."""
+    judged = judge(data.T_world_i, answers)
+    rng, reach = np.random.default_rng(0), 0.6 * data.voxel
+    surfaces = [Surface.of(points, rng) for points in data.scans]
+    gaps = [1e3 * surface_distance(surfaces, T, reach) for T in answers]
+    truth = 1e3 * surface_distance(surfaces, data.T_world_i, reach)
+    more = [
+        Metric("surfaces", float(np.median(gaps)), "mm", "down", 0.02),
+        Metric("surfaces_truth", truth, "mm", "down"),
+    ]
+    return Judged([*judged.metrics, *more], judged.samples)
 
 
 def judge(T_true: np.ndarray, answers: list[Any]) -> Judged:

@@ -21,7 +21,7 @@ def _motions(order: list[int]) -> RelativeMotions:
     right = np.linalg.inv(T_TRUE[i]) @ T_TRUE[j]
     wrong = [[motion(100 + 5 * e + k, 3) for k in range(3)] for e in range(len(PAIRS))]
     modes = np.concatenate([right[:, None], np.array(wrong, np.float32)], axis=1)
-    overlap = np.tile(np.float32([0.4, 0.2, 0.15, 0]), (len(PAIRS), 1))
+    overlap = np.tile(np.array([0.4, 0.2, 0.15, 0], np.float32), (len(PAIRS), 1))
     for e in SECOND:
         modes[e, :2] = modes[e, 1::-1]
     modes[list(LOST), 0] = modes[list(LOST), 3]
