@@ -59,6 +59,7 @@ from jaxreg._core.adjoint import (
 )
 from jaxreg._core.status import Status as Status
 from jaxreg.averaging import AveragingSolution as AveragingSolution
+from jaxreg.averaging import AveragingTrace as AveragingTrace
 from jaxreg.averaging import Correntropy as Correntropy
 from jaxreg.averaging import LowRankSparse as LowRankSparse
 from jaxreg.averaging import MotionAveraging as MotionAveraging
@@ -78,6 +79,7 @@ from jaxreg.local import PlaneToPlane as PlaneToPlane
 from jaxreg.local import PointToPlane as PointToPlane
 from jaxreg.local import PointToPoint as PointToPoint
 from jaxreg.local import RegistrationSolution as RegistrationSolution
+from jaxreg.local import SearchTrace as SearchTrace
 from jaxreg.local import Symmetric as Symmetric
 from jaxreg.multiview import ReconstructionSolution as ReconstructionSolution
 from jaxreg.multiview import RelativeMotions as RelativeMotions

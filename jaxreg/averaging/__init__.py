@@ -10,4 +10,5 @@ from jaxreg.averaging.lowrank import LowRankSparse as LowRankSparse
 from jaxreg.averaging.plain import MotionAveraging as MotionAveraging
 from jaxreg.averaging.plain import WeightedMotionAveraging as WeightedMotionAveraging
 from jaxreg.averaging.posegraph_lm import PoseGraphLM as PoseGraphLM
+from jaxreg.averaging.trace import AveragingTrace as AveragingTrace
 from jaxreg.averaging.tree import SpanningTree as SpanningTree

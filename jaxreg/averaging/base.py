@@ -11,6 +11,7 @@ from jaxreg._core.checks import is_concrete
 from jaxreg._core.solution import Solution
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, StatusArray
+from jaxreg.averaging.trace import AveragingTrace
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -35,6 +36,7 @@ class AveragingSolution(Solution):
             `T_i_j - inv(T_world_i) T_world_j` with lengths in `length_scale`
             (MCC paper, Eq. 22).
         length_scale: the length that stands for one radian; see `length_scale`.
+        trace: how the method came to rest, or None if it takes no steps.
     """
 
     T_world_i: Float[Array, "v D D"]
@@ -47,6 +49,7 @@ class AveragingSolution(Solution):
     num_steps: Int[Array, ""]
     residual: Float[Array, ""]
     length_scale: Float[Array, ""]
+    trace: AveragingTrace | None = None
 
     def __repr__(self) -> str:
         if not is_concrete(self.status) or self.status.ndim:
@@ -139,6 +142,7 @@ def solution(
     converged: Array | None = None,
     kernel_width: Array | None = None,
     num_steps: Array | int = 0,
+    trace: AveragingTrace | None = None,
 ) -> AveragingSolution:
     """Fills in what is the same for every method."""
     dtype = T_world_i.dtype
@@ -158,4 +162,5 @@ def solution(
         num_steps=jnp.asarray(num_steps, jnp.int32),
         residual=weighted_mean(frobenius(graph, T_world_i, scale), graph.weight),
         length_scale=scale,
+        trace=trace,
     )

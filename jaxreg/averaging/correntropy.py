@@ -43,6 +43,7 @@ from jaxreg.averaging.scales import (
     gaussian_trust,
 )
 from jaxreg.averaging.support import without_lone_closures
+from jaxreg.averaging.trace import AveragingTrace, no_rows
 from jaxreg.averaging.tree import along_frames, start
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -190,15 +191,17 @@ class Correntropy(AbstractAverager):
             best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, s[1])
             return s[0] + 1, best, jnp.where(better, score, s[2])
 
+        zero = jnp.asarray(0, jnp.int32)
         none = Iterated(
             T_start,
             jnp.zeros_like(graph.weight),
             width,
             jnp.asarray(False),
-            jnp.asarray(0, jnp.int32),
+            zero,
+            AveragingTrace.of(no_rows(self.max_steps, width.dtype), zero),
         )
         low = jnp.asarray(-jnp.inf, width.dtype)
-        start = (jnp.asarray(0, jnp.int32), none, low)
+        start = (zero, none, low)
         end = jax.lax.while_loop(unfinished, tried, start)[1]
         return gauss_newton_gradients(graph, end, gaussian_trust, followed)
 
@@ -238,6 +241,7 @@ def _solution(graph: PoseGraph, end: Iterated) -> AveragingSolution:
         converged=end.converged,
         kernel_width=end.width,
         num_steps=end.num_steps,
+        trace=end.trace,
     )
 
 

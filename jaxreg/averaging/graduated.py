@@ -12,12 +12,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.base import length_scale, masked_quantile, num_held
+from jaxreg.averaging.base import (
+    length_scale,
+    masked_quantile,
+    num_held,
+    weighted_mean,
+)
+from jaxreg.averaging.edge_errors import LOG_ERROR
 from jaxreg.averaging.evidence import redundancies, redundancy
 from jaxreg.averaging.gauss_newton import gauss_newton_gradients, precisions
-from jaxreg.averaging.iterate import Iterated
+from jaxreg.averaging.iterate import Iterated, pose_change
 from jaxreg.averaging.posegraph_lm import (
-    LOG_ERROR,
     Minimum,
     Problem,
     minimise,
@@ -25,6 +30,7 @@ from jaxreg.averaging.posegraph_lm import (
     robust_problem,
 )
 from jaxreg.averaging.scales import CHI2_MEDIAN
+from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.robust import Correntropy
@@ -53,6 +59,7 @@ class _State(NamedTuple):
     next_width: Array
     round: Array
     done: Array
+    rows: Array  # of the trace
 
 
 class _Best(NamedTuple):
@@ -116,6 +123,7 @@ def graduated(
         _DEVIATIONS * end.parts,
         end.found.converged,
         end.found.step,
+        AveragingTrace.of(end.rows, end.round),
     )
     return gauss_newton_gradients(graph, result, lambda g, T, _: trust_of(g, T, end))
 
@@ -137,9 +145,10 @@ def _before(graph: PoseGraph, doubt: Array, T_start: Array) -> _State:
     width = _first_width(graph, doubt == 1, T_start, squares)
     none = jnp.asarray(0, jnp.int32)
     cycle = no_cycle(_problem(graph, parts, width), T_start)
-    start = Minimum(T_start, jnp.asarray(False), none, cycle)
+    start = Minimum(T_start, jnp.asarray(False), none, cycle, None)
     unlimited = jnp.full_like(width, jnp.inf)
-    return _State(start, parts, unlimited, width, none, jnp.asarray(False))
+    rows, no = no_rows(_ROUNDS + 1, T_start.dtype), jnp.asarray(False)
+    return _State(start, parts, unlimited, width, none, no, rows)
 
 
 def _narrowed(graph: PoseGraph, doubt: Array, T_start: Array, max_steps: int) -> _State:
@@ -158,10 +167,17 @@ def _narrowed(graph: PoseGraph, doubt: Array, T_start: Array, max_steps: int) ->
         deviation = _inside_deviation(graph, squares, trust, s.next_width)
         width = jnp.clip(_DEVIATIONS * deviation, 0.5 * s.next_width, s.next_width)
         width = jnp.maximum(width, 64 * jnp.finfo(width.dtype).eps)
-        new = new._replace(step=s.found.step + new.step)
+        new = new._replace(step=s.found.step + new.step, trace=None)
+        row = (
+            pose_change(s.found.T, new.T, scale),
+            s.next_width * s.parts,
+            weighted_mean(trust, graph.weight),
+        )
+        rows = with_row(s.rows, s.round, *row)
         parts = jnp.where(last, s.parts, _parts(graph, new.T, trust))
-        return _State(new, parts, s.next_width, width, s.round + 1, last)
+        return _State(new, parts, s.next_width, width, s.round + 1, last, rows)
 
+    scale = length_scale(graph)
     start = _before(graph, doubt, T_start)
     return jax.lax.while_loop(lambda s: ~s.done, turn, start)
 

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.averaging.base import length_scale
+from jaxreg.averaging.base import length_scale, weighted_mean
 from jaxreg.averaging.implicit import differentiable
 from jaxreg.averaging.laplacian import divergence, solve_flow
+from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 
@@ -34,6 +35,7 @@ class Iterated(NamedTuple):
     width: Float[Array, "2"]
     converged: Bool[Array, ""]
     num_steps: Int[Array, ""]
+    trace: AveragingTrace
 
 
 class _State(NamedTuple):
@@ -41,6 +43,7 @@ class _State(NamedTuple):
     width: Array
     change: Array
     step: Array
+    rows: Array  # of the trace
 
 
 def nearby_rotation(T: Float[Array, "*b D D"]) -> Float[Array, "*b D D"]:
@@ -124,20 +127,26 @@ def iterate(
 
     def step(s: _State) -> _State:
         width = width_of(graph, s.T, s.width)
-        T = step_of(graph, s.T, trust_of(graph, s.T, width), width)
+        trust = trust_of(graph, s.T, width)
+        T = step_of(graph, s.T, trust, width)
+        moved = pose_change(s.T, T, scale)
+        trusted = weighted_mean(trust, graph.weight)
+        rows = with_row(s.rows, s.step, moved, width, trusted)
         shrinking = jnp.any(width < 0.999 * s.width) & jnp.all(jnp.isfinite(s.width))
-        change = pose_change(s.T, T, scale) + jnp.where(shrinking, limit, 0)
-        return _State(T, width, change, s.step + 1)
+        change = moved + jnp.where(shrinking, limit, 0)
+        return _State(T, width, change, s.step + 1, rows)
 
     start = _State(
         T=T_start,
         width=width_start,
         change=jnp.asarray(jnp.inf, T_start.dtype),
         step=jnp.asarray(0, jnp.int32),
+        rows=no_rows(max_steps, T_start.dtype),
     )
     end = jax.lax.while_loop(unfinished, step, start)
     trust = trust_of(graph, end.T, end.width)
-    return Iterated(end.T, trust, end.width, end.change <= limit, end.step)
+    trace = AveragingTrace.of(end.rows, end.step)
+    return Iterated(end.T, trust, end.width, end.change <= limit, end.step, trace)
 
 
 def pose_change(T_old: Array, T_new: Array, scale: Array) -> Array:

@@ -160,4 +160,5 @@ def _cut(found: AveragingSolution, lane: int, graph: PoseGraph) -> AveragingSolu
         num_steps=put(found.num_steps[lane]),
         residual=put(found.residual[lane]),
         length_scale=put(found.length_scale[lane]),
+        trace=jax.tree.map(lambda x: put(x[lane]), found.trace),
     )

@@ -123,7 +123,11 @@ def _least_squares(
     end = iterate_plain(graph, T_start, rows, max_steps=max_steps, tolerance=tolerance)
     end = averaging_gradients(graph, end, _full_trust, rows)
     return solution(
-        graph, end.T_world_i, converged=end.converged, num_steps=end.num_steps
+        graph,
+        end.T_world_i,
+        converged=end.converged,
+        num_steps=end.num_steps,
+        trace=end.trace,
     )
 
 

@@ -26,16 +26,25 @@ from jaxreg.averaging.base import (
     AveragingSolution,
     length_scale,
     solution,
+    weighted_mean,
 )
 from jaxreg.averaging.block_system import solve_block_flow
+from jaxreg.averaging.edge_errors import (
+    CHORDAL_ERROR,
+    LOG_ERROR,
+    EdgeError,
+    chordal_precision,
+    log_precision,
+)
 from jaxreg.averaging.implicit import differentiable
-from jaxreg.averaging.iterate import nearby_rotation
+from jaxreg.averaging.iterate import nearby_rotation, pose_change
 from jaxreg.averaging.laplacian import divergence
 from jaxreg.averaging.multigrid import Multigrid, anchored, matmul, multigrid
 from jaxreg.averaging.plain import MotionAveraging
+from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.averaging.tree import start
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
+from jaxreg.graph.pose_graph import PoseGraph, product
 from jaxreg.robust import AbstractKernel
 
 
@@ -109,6 +118,7 @@ class PoseGraphLM(AbstractAverager):
             edge_weight=problem.trust(problem.squares(T)),
             converged=end.converged,
             num_steps=end.step,
+            trace=end.trace,
         )
 
     def _with_gradients(
@@ -133,20 +143,13 @@ class PoseGraphLM(AbstractAverager):
 
     def _problem(self, graph: PoseGraph) -> "Problem":
         if self.objective == "chordal":
-            error, precision = _CHORDAL, _chordal_precision(graph)
+            error, precision = CHORDAL_ERROR, chordal_precision(graph)
         else:
-            error, precision = LOG_ERROR, _log_precision(graph)
+            error, precision = LOG_ERROR, log_precision(graph)
         if self.kernel is None:
             return Problem(graph, error, precision, lambda s: s, jnp.ones_like)
         width = jnp.asarray(self.kernel_width)
         return robust_problem(graph, error, precision, self.kernel, width)
-
-
-class EdgeError(NamedTuple):
-    """The error of predicted motions `(e, D, D)`."""
-
-    value: Callable[[Array, Array], Array]  # (e, m), given the measured ones, too
-    jacobian: Callable[[Array, Array], Array]  # (e, m, k) to right tangents, given both
 
 
 class Problem(NamedTuple):
@@ -211,6 +214,7 @@ class Minimum(NamedTuple):
     converged: Bool[Array, ""]
     step: Int[Array, ""]
     cycle: "Cycle"
+    trace: AveragingTrace | None
 
 
 class Cycle(NamedTuple):
@@ -254,13 +258,15 @@ def minimise(
         gain=inf,
         next_gain=inf,
         step=jnp.asarray(0, jnp.int32),
+        rows=no_rows(max_steps, T_start.dtype),
     )
     end = jax.lax.while_loop(
         lambda s: (s.next_gain > limit) & (s.step < max_steps),
         lambda s: _try_step(problem, s),
         begin,
     )
-    return Minimum(end.T, end.next_gain <= limit, end.step, end.cycle)
+    trace = AveragingTrace.of(end.rows, end.step)
+    return Minimum(end.T, end.next_gain <= limit, end.step, end.cycle, trace)
 
 
 class _State(NamedTuple):
@@ -272,49 +278,11 @@ class _State(NamedTuple):
     gain: Array  # share of the cost that the last step took away
     next_gain: Array  # what the next one is expected to
     step: Array
+    rows: Array  # of the trace
 
 
 def _predicted(graph: PoseGraph, T: Array) -> Array:
     return product(lie.inverse(T)[graph.edges[:, 0]], T[graph.edges[:, 1]])
-
-
-def _log_error(predicted: Array, T_i_j: Array) -> Array:
-    return lie.log(product(lie.inverse(T_i_j), predicted))
-
-
-#: The tangent error of g2o and GTSAM.
-LOG_ERROR = EdgeError(_log_error, lambda _, r: lie.log_jacobian(r))
-
-
-def _log_precision(graph: PoseGraph) -> Array:
-    k = lie.tangent_dim(graph.dim)
-    info = graph.information
-    if info is None:
-        info = jnp.eye(k, dtype=graph.weight.dtype)
-    return graph.weight[:, None, None] * info
-
-
-def _entries(T: Array) -> Array:
-    """The entries of motions or their changes, rotation first."""
-    rotation, shift = T[..., :-1, :-1], T[..., :-1, -1]
-    return jnp.concatenate([rotation.reshape(*shift.shape[:-1], -1), shift], axis=-1)
-
-
-def _chordal_jacobian(predicted: Array, _: Array) -> Array:
-    k = lie.tangent_dim(predicted.shape[-1] - 1)
-    generators = jax.jacfwd(lie.exp)(jnp.zeros((k,), predicted.dtype))
-    moved = product(predicted[:, None], jnp.moveaxis(generators, -1, 0)[None])
-    return jnp.swapaxes(_entries(moved), -1, -2)
-
-
-_CHORDAL = EdgeError(lambda P, T_i_j: _entries(P - T_i_j), _chordal_jacobian)
-
-
-def _chordal_precision(graph: PoseGraph) -> Array:
-    kappa, tau = chordal_weights(graph)
-    d = graph.dim
-    parts = [jnp.repeat(kappa[:, None], d * d, 1), jnp.repeat(tau[:, None], d, 1)]
-    return jnp.concatenate(parts, axis=1)
 
 
 def _try_step(problem: Problem, s: _State) -> _State:
@@ -340,6 +308,9 @@ def _try_step(problem: Problem, s: _State) -> _State:
     usual = jnp.where(kept, s.cycle.usual, jnp.maximum(rounds, 1))
     shift = jnp.max(jnp.abs(lie.translation(T) - lie.translation(s.T)))
     moved = jnp.where(kept, s.cycle.moved, 0) + jnp.where(better, shift, 0)
+    change = jnp.where(better, pose_change(s.T, T, s.length), 0)
+    trusted = weighted_mean(problem.trust(problem.squares(s.T)), graph.weight)
+    no_width = jnp.full((2,), jnp.inf, T.dtype)
     # A cycle without damping knows nothing of a damped matrix.
     stale = (rounds > _STALE * usual) | ~better
     return _State(
@@ -351,4 +322,5 @@ def _try_step(problem: Problem, s: _State) -> _State:
         gain=gain,
         next_gain=gain * ratio,
         step=s.step + 1,
+        rows=with_row(s.rows, s.step, change, no_width, trusted),
     )

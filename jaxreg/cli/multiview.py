@@ -147,6 +147,7 @@ def reconstruct_scans(
         overlap=np.asarray(sol.overlap)[keep],
         weight=np.asarray(sol.edge_weight)[keep],
         inlier_rmse=np.asarray(sol.inlier_rmse)[keep],
+        trace=sol.trace,
     )
 
 

@@ -82,6 +82,7 @@ def _register(
         overlap=np.array([float(sol.overlap)]),
         weight=np.array([float(found)]),
         inlier_rmse=np.array([float(sol.inlier_rmse)]),
+        trace=sol.trace,
     )
     moved = outputs.uncentre(
         np.asarray(sol.modes.T_target_source), middles[0], middles[1]

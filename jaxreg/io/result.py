@@ -51,6 +51,7 @@ class Result:
         overlap: `(e,)` share of the points that have a partner.
         weight: `(e,)` final trust, 0 to 1.
         inlier_rmse: `(e,)` in the unit of the scans.
+        trace: of the solution, for the page.
     """
 
     names: list[str]
@@ -65,6 +66,7 @@ class Result:
     overlap: np.ndarray
     weight: np.ndarray
     inlier_rmse: np.ndarray
+    trace: Any = None
 
     @property
     def placed(self) -> np.ndarray:

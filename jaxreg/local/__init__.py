@@ -33,3 +33,4 @@ from jaxreg.local.steps import condition as condition
 from jaxreg.local.steps import decoupled_error as decoupled_error
 from jaxreg.local.steps import gyration_radius as gyration_radius
 from jaxreg.local.steps import turn_and_shift as turn_and_shift
+from jaxreg.local.trace import SearchTrace as SearchTrace

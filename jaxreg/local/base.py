@@ -15,6 +15,7 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import PointCloud
 from jaxreg.geometry import lie
+from jaxreg.local.trace import SearchTrace
 
 
 class Modes(BriefModule):
@@ -119,6 +120,7 @@ class RegistrationSolution(Solution):
             estimating equations (`pose_covariance` in `jaxreg.local.curvature`);
             lengths are in the unit of the input.
         modes: distinct poses with weights; one for a local method.
+        trace: how a particle filter came to rest; None for other methods.
     """
 
     T_target_source: Float[Array, "*b D D"]
@@ -133,6 +135,7 @@ class RegistrationSolution(Solution):
     error: Float[Array, "*b"]
     covariance: Float[Array, "*b k k"]
     modes: Modes
+    trace: SearchTrace | None = None
 
     def __repr__(self) -> str:
         """One line: status, fitness, residual."""

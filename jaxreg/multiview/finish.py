@@ -71,6 +71,7 @@ def _solution(
     scan_status = jnp.where(scans.usable, scan_status, scans.fault)
     status = jnp.where(jnp.any(slips), Status.AMBIGUOUS, Status.CONVERGED)
     status = jnp.where(jnp.all(placed), status, Status.DISCONNECTED)
+    trace = placement.trace
     return ReconstructionSolution(
         T_world_i=_in_first_frames(scans, placement),
         status=status.astype(jnp.int32),
@@ -84,6 +85,7 @@ def _solution(
         mode=mode,
         motions=found,
         num_dropped=scans.num_dropped,
+        trace=None if trace is None else trace.in_unit(scans.radius),
     )
 
 

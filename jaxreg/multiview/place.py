@@ -10,6 +10,7 @@ from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Scalar, StatusArray
 from jaxreg.averaging import (
     AbstractAverager,
+    AveragingTrace,
     Correntropy,
     SpanningTree,
     average,
@@ -42,6 +43,7 @@ class Placement(eqx.Module):
         edge_weight: `(e,)` trust in each pair.
         mode: `(e,)` int32, which of each pair's modes was averaged.
         status: of the averaging.
+        trace: of the averaging.
     """
 
     T_world_i: Float[Array, "v D D"]
@@ -49,6 +51,7 @@ class Placement(eqx.Module):
     edge_weight: Float[Array, " e"]
     mode: Int[Array, " e"]
     status: StatusArray
+    trace: AveragingTrace | None
 
     @property
     def component(self) -> Int[Array, " v"]:
@@ -131,8 +134,8 @@ def _averaged(
     agreed = jnp.where(believed(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
     part = _confirmed_components(pairs, agreed, num_scans, _STRONG * min_overlap)
-    T_world_i = solution.T_world_i[swap]
-    return Placement(T_world_i, part, edge_weight, mode, solution.status)
+    T_world_i, status, trace = solution.T_world_i[swap], solution.status, solution.trace
+    return Placement(T_world_i, part, edge_weight, mode, status, trace)
 
 
 def _agreeing(

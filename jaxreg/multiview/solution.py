@@ -10,6 +10,7 @@ from jaxreg._core.checks import is_concrete
 from jaxreg._core.solution import Solution
 from jaxreg._core.status import Status
 from jaxreg._core.typing import StatusArray
+from jaxreg.averaging import AveragingTrace
 from jaxreg.graph import PoseGraph
 from jaxreg.multiview.relative import RelativeMotions
 
@@ -42,6 +43,8 @@ class ReconstructionSolution(Solution):
         mode: `(e,)` int32, which of the pair's modes that is, 0 the best.
         motions: every mode of every pair, in the input's frames and unit.
         num_dropped: `(v,)` rows that were not finite.
+        trace: how the averaging that chose the pairs came to rest, lengths in the unit
+            of the input; None if its method takes no steps.
     """
 
     T_world_i: Float[Array, "v D D"]
@@ -56,6 +59,7 @@ class ReconstructionSolution(Solution):
     mode: Int[Array, " e"]
     motions: RelativeMotions
     num_dropped: Int[Array, " v"]
+    trace: AveragingTrace | None = None
 
     @property
     def num_scans(self) -> int:

@@ -1,6 +1,7 @@
 """The contract of global searches: draw poses, descend, conclude."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +22,7 @@ from jaxreg.local import (
     LocalOptimiser,
     Problem,
     RegistrationSolution,
+    SearchTrace,
 )
 from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
 from jaxreg.particle.conclude import Pair, conclude
@@ -42,11 +44,13 @@ class Found(eqx.Module):
         particles: measured poses, with energies and weights.
         num_steps: int32, steps of the local optimiser along the path of one of them.
         finished: whether they had come to rest.
+        trace: of the steps of a filter.
     """
 
     particles: Particles
     num_steps: Int[Array, ""]
     finished: Bool[Array, ""]
+    trace: SearchTrace | None = None
 
 
 class AbstractSearch(AbstractRegistrar):
@@ -121,7 +125,7 @@ class AbstractSearch(AbstractRegistrar):
         pair = Pair(source, target, source_index, target_index)
         few = _some_points(key_points, pair.problem, self.num_points)
         found = self.search(key_search, few, init)
-        return conclude(
+        solution = conclude(
             pair,
             found.particles,
             found.num_steps,
@@ -131,6 +135,7 @@ class AbstractSearch(AbstractRegistrar):
             refine_steps=self.refine_steps,
             min_overlap=self.min_overlap,
         )
+        return dataclasses.replace(solution, trace=found.trace)
 
     def _optimiser(self, dtype: Any) -> LocalOptimiser:
         optimiser = LocalOptimiser(self.residual, self.kernel, self.step)

@@ -16,6 +16,8 @@ energies; the kernel width of the optimiser falls over time. `sandhu2010` has th
 paper's own.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import is_concrete
-from jaxreg._core.typing import Key, Motion
+from jaxreg._core.typing import Key, Motion, Scalar
 from jaxreg.local import (
     AbstractResidual,
     AbstractStep,
@@ -32,6 +34,7 @@ from jaxreg.local import (
     LocalOptimiser,
     PointToPlane,
     Problem,
+    SearchTrace,
 )
 from jaxreg.particle.base import AbstractSearch, Found, check_counts, check_positive
 from jaxreg.particle.draw import (
@@ -46,6 +49,7 @@ from jaxreg.particle.measure import measure
 from jaxreg.particle.priors import AbstractPrior, GivenParticles
 from jaxreg.particle.resamplers import AbstractResampler, Systematic
 from jaxreg.particle.state import Particles
+from jaxreg.particle.trace import no_rows, with_row
 from jaxreg.particle.weights import log_likelihood, normalised
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
@@ -54,6 +58,7 @@ class _Carry(eqx.Module):
     particles: Particles
     time: Int[Array, ""]
     moving: Bool[Array, ""]
+    trace: SearchTrace
 
 
 class ParticleFilter(AbstractSearch):
@@ -177,19 +182,23 @@ class ParticleFilter(AbstractSearch):
             error = jnp.where(live[:, None], jnp.abs(particles.motion_error), 0)
             # Negated: an error that is not a number has not died.
             moving = ~(jnp.max(error) <= self.tolerance)
-            return _Carry(_remembered(particles, carry.time), carry.time + 1, moving)
+            trace = with_row(carry.trace, particles, self._width(carry.time, dtype))
+            particles = _remembered(particles, carry.time)
+            return _Carry(particles, carry.time + 1, moving, trace)
 
+        trace = no_rows(self.num_times + 1, dtype)
+        trace = with_row(trace, drawn.particles, self._width(0, dtype))
         end = lax.while_loop(
             lambda c: c.moving & (c.time <= self.num_times),
             body,
-            _Carry(drawn.particles, jnp.ones((), jnp.int32), ~drawn.sure),
+            _Carry(drawn.particles, jnp.ones((), jnp.int32), ~drawn.sure, trace),
         )
         particles = end.particles.rows(slice(self.num_particles))
         steps = self.prior_steps + (end.time - 1) * self.inner_steps
         if self._settles:
             particles = _either(drawn, particles)
             steps = steps + SETTLE_STEPS
-        return Found(particles, steps, ~end.moving)
+        return Found(particles, steps, ~end.moving, end.trace)
 
     def _draw(
         self, problem: Problem, optimiser: LocalOptimiser, T: Float[Array, "p D D"]
@@ -253,8 +262,7 @@ class ParticleFilter(AbstractSearch):
             lambda p: p.log_weight, particles.rows(rows), log_weight
         )
         T_predicted = self.dynamics(key_predict, particles, time)
-        share = time.astype(T_predicted.dtype) / self.num_times
-        width = self.width_start * (self.width_end / self.width_start) ** share
+        width = self._width(time, T_predicted.dtype)
         num = T_predicted.shape[0]
         particles = measure(
             problem,
@@ -275,6 +283,12 @@ class ParticleFilter(AbstractSearch):
             batch_size=min(self.batch_size, self.num_prior),
         )
         return self._weighed(problem, particles, self.num_particles)
+
+    def _width(self, time: Int[Array, ""] | int, dtype: Any) -> Scalar:
+        """Kernel width at a time."""
+        share = jnp.asarray(time, dtype) / self.num_times
+        start = jnp.asarray(self.width_start, dtype)
+        return start * (self.width_end / start) ** share
 
     def _weighed(self, problem: Problem, particles: Particles, num: int) -> Particles:
         """With the weights of the first `num` times their likelihoods."""

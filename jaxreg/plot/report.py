@@ -11,6 +11,7 @@ from jaxreg._core.status import Status
 from jaxreg.io.colors import scan_colors
 from jaxreg.io.result import Result
 from jaxreg.plot.figure import principal_axes, tilt
+from jaxreg.plot.report_curves import trace_curves
 from jaxreg.plot.report_page import write_page
 from jaxreg.plot.report_parts import details_entry, deviations, status_entry
 from jaxreg.plot.report_points import encode_points, page_points
@@ -36,9 +37,10 @@ def write_report(
     """Writes scans and their poses as one HTML page that opens from disk.
 
     The page shows the scans before and after in a view that turns, a cross-section that
-    moves, the pairs with their trust and how far they are off, the poses, and how they
-    were made. Components beside the model are shown in turn. It holds at
-    most 110 000 points, about 6 MB with the drawing library, and loads nothing.
+    moves, the pairs with their trust and how far they are off, how the method came to
+    rest, the poses, and how they were made. Components beside the model are shown in
+    turn. It holds at most 110 000 points, about 6 MB with the drawing library, and
+    loads nothing.
 
         sol = jaxreg.reconstruct(scans, key=key)
         jaxreg.plot.write_report("report.html", scans, sol)
@@ -102,6 +104,7 @@ def write_report(
         "pairs": _pair_rows(result),
         "modes": _mode_rows(modes) if pair and modes is not None else [],
         "errors": None if errors is None else dict(errors),
+        "curves": trace_curves(result.trace),
         "details": details_entry(details),
     }
     write_page(path, data["title"], data)

@@ -9,6 +9,7 @@ import numpy as np
 import jaxreg
 from jaxreg._core.status import Status
 from jaxreg.plot.figure import principal_axes, tilt
+from jaxreg.plot.report_curves import trace_curves
 from jaxreg.plot.report_page import write_page
 from jaxreg.plot.report_parts import (
     details_entry,
@@ -36,8 +37,8 @@ def write_graph_report(
     """Writes an averaged pose graph as one HTML page that opens from disk.
 
     The page shows the positions and edges before and after, the edges by whether they
-    are trusted and how far they are off, beside the width of the kernel, the poses, and
-    how they were made.
+    are trusted and how far they are off, beside the width of the kernel, how the steps
+    came to rest, the poses, and how they were made.
 
     Args:
         path: the HTML file; it appears whole or not at all.
@@ -99,6 +100,7 @@ def write_graph_report(
         "kernel_width": width.tolist(),
         "steps": int(solution.num_steps),
         "residual": float(solution.residual),
+        "curves": trace_curves(solution.trace, int(solution.num_steps)),
         "details": details_entry(details),
     }
     write_page(path, title, data)

@@ -18,6 +18,7 @@ _SCRIPTS = (
     "pairs.js",
     "graph.js",
     "residuals.js",
+    "curves.js",
     "tables.js",
 )
 

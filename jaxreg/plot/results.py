@@ -55,6 +55,7 @@ def result_of(
         overlap=np.atleast_1d(solution.overlap)[keep],
         weight=weight,
         inlier_rmse=np.atleast_1d(solution.inlier_rmse)[keep],
+        trace=solution.trace,
     )
 
 

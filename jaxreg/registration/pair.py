@@ -1,5 +1,7 @@
 """One pair: cleaned, centred and scaled, prepared, solved, and back."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -107,6 +109,10 @@ class _Frames(eqx.Module):
             solution.H, solution.b, solution.error, solution.covariance
         ).scaled(self.radius)
         modes = solution.modes
+        trace = solution.trace
+        if trace is not None:
+            width = self.radius * trace.kernel_width
+            trace = dataclasses.replace(trace, kernel_width=width)
         unit = tangent_unit(self.radius, modes.covariance.shape[-1])
         return RegistrationSolution(
             T_target_source=back(solution.T_target_source),
@@ -128,6 +134,7 @@ class _Frames(eqx.Module):
                 self.radius * modes.inlier_rmse,
                 modes.covariance * jnp.outer(unit, unit),
             ),
+            trace=trace,
         )
 
 

@@ -178,6 +178,26 @@ def test_edge_weights_name_the_outliers():
     assert "trusted" in repr(solution)
 
 
+def test_the_trace_tells_how_the_kernel_narrowed_and_the_steps_came_to_rest():
+    X, edges, T, _ = random_graph(N, H, 0.4, 3)
+    method = METHODS["annealed"]
+    solution = average(single(X, edges, T), method)
+    trace = solution.trace
+    assert trace is not None
+    num = int(trace.num_rows)
+    assert num == int(solution.num_steps) > 1
+    for rows in (trace.change, trace.kernel_width, trace.trust):
+        assert len(rows) == method.max_steps
+        assert not np.any(rows[num:])
+    width = np.asarray(trace.kernel_width[:num])
+    assert (np.diff(width, axis=0) <= 0).all()
+    np.testing.assert_array_equal(width[-1], solution.kernel_width)
+    assert trace.change[num - 1] < 1e-5 < trace.change[0]
+    trust = float(jnp.mean(solution.edge_weight))
+    np.testing.assert_allclose(trace.trust[num - 1], trust, atol=1e-4)
+    assert average(single(X, edges, T), METHODS["paths"]).trace is None
+
+
 @pytest.mark.parametrize("kind", ["averaging", "gauss-newton"])
 def test_gradients_agree_with_differences(kind):
     """At a fixed kernel width, since widths are cut from the gradient."""

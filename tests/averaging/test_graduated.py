@@ -52,6 +52,12 @@ def test_false_closures_of_a_large_graph_are_found():
         assert graph.num_poses > DENSE_LIMIT
         solution = average(graph)
         assert solution.status == Status.CONVERGED
+        trace = solution.trace
+        assert trace is not None
+        num = int(trace.num_rows)
+        assert 1 < num <= int(solution.num_steps)
+        width = np.asarray(trace.kernel_width[: num - 1])
+        assert width[-1, 0] < 0.5 * width[0, 0]
         true = jnp.asarray(X, jnp.float32)
         T = align_poses(solution.T_world_i, true, "best")
         assert float(jnp.max(translation_errors(T, true))) < 0.3

@@ -128,6 +128,11 @@ def test_single_precision_from_the_motions_alone():
     assert solution.status == Status.CONVERGED
     assert solution.T_world_i.dtype == jnp.float32
     np.testing.assert_allclose(solution.T_world_i, X, atol=1e-4)
+    num, trace = int(solution.num_steps), solution.trace
+    assert trace is not None
+    assert int(trace.num_rows) == num
+    assert trace.change[num - 1] < 1e-4
+    assert np.isinf(trace.kernel_width[:num]).all()
 
 
 @pytest.mark.data

@@ -61,6 +61,8 @@ def test_all_scans_are_placed_without_a_guess(sculpture, solved):
 def test_every_pair_is_reported_with_what_is_known_of_it(sculpture, solved):
     sol, _, _ = solved
     assert sol.graph.num_edges == 28
+    assert sol.trace is not None
+    assert int(sol.trace.num_rows) > 1
     trusted = np.asarray(sol.edge_weight) > 0.5
     assert trusted.sum() >= 7
     for e in np.flatnonzero(trusted):

@@ -163,7 +163,16 @@ def test_draws_end_when_several_agree_and_not_on_a_symmetric_object():
     assert shift < 0.05
     # None of the 16 that the filter would have carried on, behind 32 settled ones.
     assert not np.isfinite(sure.particles.energy[32:]).any()
+    assert int(sure.trace.num_rows) == 1
+    assert int(sure.trace.num_measured[0]) < 128
     assert int(torn.num_steps) > drawn
+    trace, num = torn.trace, int(torn.trace.num_rows)
+    assert num > 1
+    np.testing.assert_array_equal(trace.num_measured[:num], [128] + (num - 1) * [16])
+    assert (trace.least_energy < trace.median_energy)[:num].all()
+    assert (trace.effective_size[:num] <= trace.num_measured[:num] + 0.01).all()
+    assert (np.diff(trace.kernel_width[:num]) < 0).all()
+    assert not np.any(trace.least_energy[num:])
     assert np.isfinite(torn.particles.energy).all()
 
 

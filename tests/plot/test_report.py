@@ -2,6 +2,7 @@
 
 import base64
 import builtins
+import dataclasses
 import json
 import re
 from collections.abc import Iterator
@@ -256,9 +257,17 @@ def test_modes_on_a_dark_phone(page: Page, tmp_path: Path):
     flip = result.T_world_i[1] @ motion(5, 3, angle=2.0, shift=0.0)
     modes = (np.stack([result.T_world_i[1], flip]), np.array([0.7, 0.3]), np.ones(2))
     covariances = np.stack([np.zeros((6, 6)), 1e-6 * np.eye(6)])
+    rows = jnp.array([0.5, 0.2, 0.1])
+    trace = jaxreg.SearchTrace(
+        jnp.asarray(2), jnp.array([96, 16, 0]), rows, 2 * rows, 9 * rows, rows
+    )
     path = tmp_path / "report.html"
+    result = dataclasses.replace(result, trace=trace)
     write_report(path, scans, result, modes=modes, covariances=covariances)
     page.open(path, width=390, height=844, dark=True)
+    assert "96" in page.run("document.getElementById('curves-note').textContent")
+    drawn = "document.getElementById('curves').data.map(line => line.y.length)"
+    assert page.run(drawn) == [2, 2, 2, 2]  # two energies, sample size, width
     assert page.run("document.documentElement.scrollWidth") <= 390
     assert page.run("document.querySelectorAll('#modes button').length") == 2
     assert "σ" in page.run("document.getElementById('poses').textContent")
@@ -281,6 +290,7 @@ def test_flat_scans_from_a_solution(page: Page, tmp_path: Path):
         page.run("document.getElementById('title').textContent") == "source onto target"
     )
     assert page.run("document.getElementById('section-card').hidden")
+    assert page.run("document.getElementById('curves-card').hidden")
     assert _ink(page, tmp_path / "shot.png") > 0.005
     _quiet(page)
 
@@ -294,15 +304,22 @@ def test_graphs_in_a_browser(page: Page, tmp_path: Path, d: int):
     graph = jaxreg.PoseGraph.from_edges(edges, T_i_j.astype(np.float32))
     before = jaxreg.average(graph, method=jaxreg.SpanningTree())
     path = tmp_path / "report.html"
+    change, width = jnp.array([0.3, 0.0, 1e-6, 0.0]), jnp.full((4, 2), 0.1)
+    trace = jaxreg.AveragingTrace(jnp.asarray(3), change, width, 0.9 - change)
     after = eqx.tree_at(
-        lambda s: (s.kernel_width, s.edge_weight),
+        lambda s: (s.kernel_width, s.edge_weight, s.trace),
         before,
-        (jnp.array([0.1, 0.05]), before.edge_weight.at[-1].set(0)),
+        (jnp.array([0.1, 0.05]), before.edge_weight.at[-1].set(0), trace),
+        is_leaf=lambda x: x is None,
     )
     write_graph_report(path, graph, after, before)
     page.open(path)
     assert _ink(page, tmp_path / "shot.png", "#residuals") > 0.001
     assert "kernel width" in page.run("document.getElementById('tiles').textContent")
+    assert _ink(page, tmp_path / "shot.png", "#curves") > 0.001
+    curve = "document.getElementById('curves').data[0].y"
+    assert page.run(f"{curve}[1]") is None  # a step that was refused
+    assert page.run(f"{curve}[2]") == pytest.approx(1e-6)
     lines = "document.getElementById('residuals').layout.shapes.length"
     assert page.run(lines) == 2
     assert _ink(page, tmp_path / "shot.png") > 0.002

@@ -124,6 +124,7 @@ details();
 (SCANS ? startScans() : startGraph()).then(() => {
   if (SCANS && !FLAT) startSection();
   startResiduals();
+  startCurves();
   if (SCANS && DATA.pairs.length && DATA.scans.length > 2) startPairs();
   else $("section-card").classList.add("full");
   // Colours of the drawings follow when the system turns dark or light.
