@@ -98,7 +98,9 @@ WORKLOADS = {
     "multiview": Workload(
         "Many scans into one frame",
         "Scans to poses, no guess. Errors are those of the MCC paper, e_R and e_t, "
-        "with scan 0 as the common frame.",
+        "with scan 0 as the common frame. `surfaces` is how far overlapping scans are "
+        "from each other along normals, `surfaces_truth` at the published poses: the "
+        "median over pairs of their medians.",
     ),
     "multiview_robust": Workload(
         "Many scans of which some do not belong",
