@@ -13,6 +13,7 @@ from jaxreg.multiview.hold import Held
 from jaxreg.multiview.place import Placement, displacement, place
 from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative import RelativeMotions
+from jaxreg.multiview.rivals import turnable
 from jaxreg.multiview.scans import PreparedScans
 from jaxreg.multiview.slip import slipping
 from jaxreg.multiview.solution import ReconstructionSolution
@@ -37,14 +38,14 @@ def finish(
     """
     min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
     placement = place(motions, scans.num_scans, averaging, min_overlap)
-    mode = placement.mode
+    mode, turns = placement.mode, turnable(motions, placement)
     placement = refine(scans, placement, averaging, min_overlap / 2)
     if hold is None:
-        slips = slipping(scans, placement, min_overlap)
-        return _solution(scans, motions, mode, placement, slips, min_overlap)
+        free = turns | slipping(scans, placement, min_overlap)
+        return _solution(scans, motions, mode, placement, free, min_overlap)
     placement = hold.place(scans, placement, averaging, min_overlap / 2)
-    slips = slipping(scans, placement, min_overlap) & ~hold.held
-    solution = _solution(scans, motions, mode, placement, slips, min_overlap)
+    free = (turns | slipping(scans, placement, min_overlap)) & ~hold.held
+    solution = _solution(scans, motions, mode, placement, free, min_overlap)
     return hold.in_world(solution)
 
 
@@ -54,7 +55,7 @@ def _solution(
     motions: RelativeMotions,
     mode: Int[Array, " e"],
     placement: Placement,
-    slips: Bool[Array, " v"],
+    free: Bool[Array, " v"],
     min_overlap: Scalar,
 ) -> ReconstructionSolution:
     """In the frames and unit of the input."""
@@ -67,9 +68,9 @@ def _solution(
     component, placed = placement.component, placement.placed
     scan_status = jnp.where(component < 0, Status.LOW_OVERLAP, Status.DISCONNECTED)
     scan_status = jnp.where(placed, Status.CONVERGED, scan_status)
-    scan_status = jnp.where(slips, Status.AMBIGUOUS, scan_status)
+    scan_status = jnp.where(free & (component >= 0), Status.AMBIGUOUS, scan_status)
     scan_status = jnp.where(scans.usable, scan_status, scans.fault)
-    status = jnp.where(jnp.any(slips), Status.AMBIGUOUS, Status.CONVERGED)
+    status = jnp.where(jnp.any(free & placed), Status.AMBIGUOUS, Status.CONVERGED)
     status = jnp.where(jnp.all(placed), status, Status.DISCONNECTED)
     trace = placement.trace
     return ReconstructionSolution(

@@ -164,6 +164,13 @@ def part_sizes(part: Int[Array, " v"]) -> Int[Array, " v"]:
     return jnp.sum(part[:, None] == part[None, :], axis=1)
 
 
+def in_main_body(body: Int[Array, " v"], part: Int[Array, " v"]) -> Bool[Array, " v"]:
+    """Whether each scan's body is the largest in its part."""
+    same = part[:, None] == part[None, :]
+    largest = jnp.argmax(jnp.where(same, part_sizes(body)[None, :], 0), axis=1)
+    return body == body[largest]
+
+
 def _with_hung(graph: PoseGraph, hung: Bool[Array, " v"], weight: Scalar) -> PoseGraph:
     """With a motion from frame 0 to each frame of `hung`: none contradicts it."""
     num, D = hung.shape[0], graph.T_i_j.shape[-1]

@@ -15,7 +15,7 @@ from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
 from jaxreg.graph.trees import components
 from jaxreg.local import Grip, Problem, agreeing, match
-from jaxreg.multiview.place import Placement, part_sizes
+from jaxreg.multiview.place import Placement, in_main_body
 from jaxreg.multiview.scans import PreparedScans
 
 
@@ -32,10 +32,7 @@ def slipping(
     """
     pairs = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
     body = _bodies(pairs, _grips(scans, placement, pairs, min_overlap), scans.num_scans)
-    size = part_sizes(body)
-    same = placement.part[:, None] == placement.part[None, :]
-    largest = jnp.argmax(jnp.where(same, size[None, :], 0), axis=1)
-    return body != body[largest]
+    return ~in_main_body(body, placement.part)
 
 
 def _grips(

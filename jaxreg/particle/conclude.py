@@ -37,9 +37,11 @@ from jaxreg.robust import AbstractKernel
 
 # Poses nearer than this, in radians and radii, are one mode.
 _APART = 0.3
-# A second mode is a rival of the first if its overlap is more than this share of the
-# first's, or its weight: by chance alone, two standard errors.
-_RIVAL_OVERLAP, _RIVAL_WEIGHT = 0.95, 0.13
+#: A second mode is a rival of the first if its overlap is more than this share of the
+#: first's,
+RIVAL_OVERLAP = 0.95
+# or its weight: by chance alone, two standard errors.
+_RIVAL_WEIGHT = 0.13
 # Steps of the most accurate residual, where it is close already.
 _POLISH = 8
 
@@ -128,7 +130,7 @@ def conclude(
         pair.problem, kernel, T_modes, overlap >= 0, 0.5 * spacing, steps
     )
     best, curvature = jax.tree.map(lambda x: x[0], (there, curvatures))
-    rival = (overlap[1:] > _RIVAL_OVERLAP * overlap[0]) | (
+    rival = (overlap[1:] > RIVAL_OVERLAP * overlap[0]) | (
         weight[1:] > _RIVAL_WEIGHT * weight[0]
     )
     doubtful = jnp.any(rival) | can_slip(pair.problem, T_modes[0], spacing)

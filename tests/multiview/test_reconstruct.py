@@ -9,7 +9,7 @@ from helpers import blob, half_noise, motion, move, pose_error
 
 import jaxreg as jr
 from jaxreg import Status
-from jaxreg.datasets import sculpture_scans
+from jaxreg.datasets import cube_points, sculpture_scans
 from jaxreg.multiview import RelativeMotions
 from jaxreg.multiview.inputs import padded_scans
 
@@ -219,6 +219,17 @@ def test_spheres_are_ambiguous(sculpture):
     sol = jr.reconstruct(spheres, key=jax.random.key(0), method=FILTER)
     assert int(sol.status) == Status.AMBIGUOUS
     assert np.sum(np.asarray(sol.scan_status) == Status.AMBIGUOUS) >= 7
+
+
+def test_cubes_are_ambiguous():
+    # Each fits the others in 24 poses.
+    cubes = []
+    for seed in range(8):
+        points = cube_points(3000, seed, side=0.2).astype(np.float32)
+        cubes.append(move(motion(seed, 3), points))
+    sol = jr.reconstruct(cubes, key=jax.random.key(0), method=FILTER)
+    assert int(sol.status) == Status.AMBIGUOUS
+    assert np.sum(np.asarray(sol.scan_status) == Status.AMBIGUOUS) == 7
 
 
 def test_identical_scans_lie_on_each_other(sculpture):
