@@ -28,13 +28,11 @@ KEY = jax.random.key(0)
 class Row:
     """A method by dimension, and its slopes.
 
-    Exact; exact where kernel widths do not change; or zero, where they are cut. Methods
-    that another row runs are only traced.
+    Exact; exact where kernel widths do not change; or zero, where they are cut.
     """
 
     make: Callable[[int], Any]
     slopes: Literal["exact", "at held widths", "zero"]
-    runs: bool = True
 
 
 _SEARCH: dict[str, Any] = {
@@ -56,16 +54,16 @@ REGISTRARS = {
         "zero",
     ),
     "MultiStart": Row(
-        lambda d: jr.MultiStart(num_starts=16, num_steps=8, **_SEARCH), "zero", False
+        lambda d: jr.MultiStart(num_starts=16, num_steps=8, **_SEARCH), "zero"
     ),
     "sandhu2010": Row(
-        lambda d: jr.sandhu2010(d, 8, num_times=2, num_points=NUM_POINTS), "zero", False
+        lambda d: jr.sandhu2010(d, 8, num_times=2, num_points=NUM_POINTS), "zero"
     ),
 }
 #: Methods of `average`.
 AVERAGERS = {
     "SpanningTree": Row(lambda d: jr.SpanningTree(), "zero"),
-    "CycleConsensus": Row(lambda d: CycleConsensus(), "zero", False),
+    "CycleConsensus": Row(lambda d: CycleConsensus(), "zero"),
     "LowRankSparse": Row(lambda d: jr.LowRankSparse(), "zero"),
     "MotionAveraging": Row(lambda d: jr.MotionAveraging(tolerance=1e-13), "exact"),
     "WeightedMotionAveraging": Row(
@@ -105,6 +103,14 @@ def pair(d: int, dtype: type, seed: int = 0) -> tuple[jax.Array, jax.Array]:
     noise = 0.05 * rng.standard_normal(source.shape)
     target = move(motion(seed, d, angle=0.15, shift=0.05), source + noise)
     return jnp.asarray(source, dtype), jnp.asarray(target, dtype)
+
+
+def scans(d: int, dtype: type, seed: int = 0) -> jax.Array:
+    """Three samples of a closed surface, some degrees apart."""
+    poses = [motion(10 * seed + i, d, angle=0.3, shift=0.1) for i in range(3)]
+    samples = [blob(NUM_POINTS, d, i).astype(float) for i in range(3)]
+    moved = [move(T, x) for T, x in zip(poses, samples, strict=True)]
+    return jnp.asarray(np.stack(moved), dtype)
 
 
 def pair_changes(d: int, dtype: type) -> list[tuple[np.ndarray, np.ndarray]]:

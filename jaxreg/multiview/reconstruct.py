@@ -88,6 +88,7 @@ def reconstruct(
     """
     points, row_mask = padded_scans(scans, mask)
     eyes = checked_viewpoints(viewpoints, points, row_mask)
+    points, eyes = jax.lax.stop_gradient((points, eyes))
     method = ParticleFilter() if method is None else method
     if not isinstance(method, ParticleFilter):
         raise TypeError(

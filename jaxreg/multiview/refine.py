@@ -98,7 +98,8 @@ def measured(
     """The motion and overlap of every pair of a part near the present poses, m = 1."""
     T_world_i, alone = placement.T_world_i, part_sizes(placement.part) == 1
     spacing = jnp.max(jnp.where(alone, 0, scans.spacing))
-    widths = spacing * jnp.asarray(_EXACT_WIDTHS if exact else _TABLE_WIDTHS)
+    factors = _EXACT_WIDTHS if exact else _TABLE_WIDTHS
+    widths = spacing * jnp.asarray(factors, spacing.dtype)
     optimiser = LocalOptimiser(PlaneToPlane(0.01), GemanMcClure(), GaussNewton())
     optimiser = cast_floats(optimiser, T_world_i.dtype)
 

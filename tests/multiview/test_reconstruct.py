@@ -87,21 +87,6 @@ def test_progress_names_stages_and_ends_at_the_total(solved):
         assert done[-1] == total
 
 
-def test_one_program_under_jit_gives_the_same_poses(sculpture, solved):
-    scans, _ = sculpture
-    rows = max(map(len, scans))
-    padded = np.stack([np.pad(s, ((0, rows - len(s)), (0, 0))) for s in scans])
-    mask = np.arange(rows) < np.array([len(s) for s in scans])[:, None]
-    run = jax.jit(
-        lambda p, m: jr.reconstruct(p, mask=m, key=jax.random.key(0), method=FILTER)
-    )
-    sol = run(jnp.asarray(padded), jnp.asarray(mask))
-    for T, expected in zip(sol.T_world_i, solved[0].T_world_i, strict=True):
-        angle, shift = pose_error(T, expected)
-        assert angle < 2e-3
-        assert shift < 5e-4
-
-
 def test_an_interrupted_run_goes_on_to_the_same_answer(sculpture, solved):
     sol, _, found = solved
     kept, new = RelativeMotions.joined(found[2:]), []
