@@ -10,6 +10,7 @@ from helpers import blob, motion, move, switched_on
 from protocols import graph, measured
 
 import jaxreg as jr
+from jaxreg.averaging.implicit import DENSE_UNKNOWNS
 from jaxreg.cloud import PointCloud, estimate_normals
 from jaxreg.geometry.kabsch import kabsch
 from jaxreg.robust import L2, Cauchy, Tukey
@@ -52,12 +53,12 @@ def _answer(sol) -> jax.Array:
     return jnp.sum(jnp.cos(jnp.arange(T.size, dtype=T.dtype)).reshape(T.shape) * T)
 
 
-def _check_slopes(value, num: int):
+def _check_slopes(value, num: int, step: float = STEP):
     """Against central differences in each of so many arguments."""
-    sides = STEP * np.concatenate([np.eye(num), -np.eye(num)])
+    sides = step * np.concatenate([np.eye(num), -np.eye(num)])
     at = jnp.asarray(np.concatenate([np.zeros((1, num)), sides]))
     found, slopes = jax.jit(jax.vmap(jax.value_and_grad(value)))(at)
-    numeric = (found[1 : num + 1] - found[num + 1 :]) / (2 * STEP)
+    numeric = (found[1 : num + 1] - found[num + 1 :]) / (2 * step)
     assert np.all(np.abs(numeric) > 1e-4)
     np.testing.assert_allclose(slopes[0], numeric, rtol=1e-5)
 
@@ -162,6 +163,29 @@ def test_averaging_has_finite_gradients_where_formulas_are_singular(name):
     assert np.isfinite(by_T).all()
     assert np.isfinite(by_weight).all()
     assert np.abs(by_T).max() > 1e-3
+
+
+def test_graphs_too_large_for_a_dense_matrix_have_exact_gradients():
+    """134 poses in the plane: 402 unknowns, so by GMRES."""
+    num, rng = 134, np.random.default_rng(0)
+    assert 3 * num > DENSE_UNKNOWNS
+    row = np.arange(num)
+    near = np.stack([row[:-1], row[1:]], 1)
+    edges = np.concatenate([near, np.stack([row[:-9:3], row[9::3]], 1)])
+    X = np.stack([motion(k, 2) for k in range(num)])
+    noise = [motion(k, 2, angle=0.05, shift=0.05) for k in range(len(edges))]
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ np.stack(noise)
+    shift, change = np.zeros_like(T), rng.standard_normal(len(edges))
+    shift[:, :2, 2] = rng.standard_normal((len(edges), 2))
+    method = jr.PoseGraphLM(tolerance=1e-15)
+    probe = jnp.asarray(rng.standard_normal(X.shape))
+
+    def value(x):
+        moved = jr.PoseGraph.from_edges(edges, T + x[0] * shift, num, 1 + x[1] * change)
+        return jnp.sum(probe * jr.average(moved, method, X).T_world_i)
+
+    # Steps end when the sum of squares stands still, so where poses move by 1e-8.
+    _check_slopes(value, 2, step=1e-3)
 
 
 def _bytes(value, *args) -> int:

@@ -15,7 +15,8 @@ from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 
 
-_DENSE_UNKNOWNS = 400
+#: More of them are solved for by GMRES.
+DENSE_UNKNOWNS = 400
 
 
 def differentiable(
@@ -49,7 +50,7 @@ def differentiable(
         balance = imbalance(graph, product(lie.exp(tangent), fixed))
         return jnp.where(free, balance, tangent).reshape(-1)
 
-    small = num * k <= _DENSE_UNKNOWNS
+    small = num * k <= DENSE_UNKNOWNS
     if precondition is None:
         precondition = _inverse_laplacian(graph.edges, weight)
     solver = _dense if small else _krylov(precondition, k)
