@@ -3,6 +3,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from helpers import switched_on
 
 
 # Set before JAX starts: compiled programs are shared between runs and workers.
@@ -20,3 +21,10 @@ def _bounded_number_of_live_programs() -> Iterator[None]:
     import jax
 
     jax.clear_caches()
+
+
+@pytest.fixture(scope="module")
+def quickly_compiled() -> Iterator[None]:
+    """For modules of small problems, whose time is that of compiling."""
+    with switched_on("jax_disable_most_optimizations"):
+        yield

@@ -13,6 +13,9 @@ from jaxreg.metrics import rotation_error, rotation_errors
 from tests.averaging.graphs import folding_graph, noisy_grid, random_graph
 
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
 N, H = 16, 100
 log_odds = jax.jit(edge_log_odds)
 

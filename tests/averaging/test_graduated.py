@@ -1,5 +1,6 @@
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxreg import Status
 from jaxreg.averaging import average
@@ -7,6 +8,9 @@ from jaxreg.averaging.laplacian import DENSE_LIMIT
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import align_poses, translation_errors
 from tests.averaging.graphs import motions, rotations
+
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
 LAP, LAPS = 50, 4

@@ -15,6 +15,9 @@ from jaxreg.cloud import PointCloud
 from jaxreg.correlation import KernelCorrelation, kernel_correlation
 
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
 N, M = 150, 200
 WIDTH = 0.25
 LANES = 64

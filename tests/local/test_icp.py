@@ -10,6 +10,9 @@ from jaxreg import Status
 from jaxreg.robust import L2
 
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
 N, M = 500, 800
 
 

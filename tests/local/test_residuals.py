@@ -19,6 +19,9 @@ from jaxreg.local import (
 )
 
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
 EPSILON = 1 / 128
 RESIDUALS = [PointToPoint(), PointToPlane(0.25), PlaneToPlane(EPSILON), Symmetric()]
 by_residual = pytest.mark.parametrize(

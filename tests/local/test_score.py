@@ -15,6 +15,9 @@ from jaxreg.local import Grip, Problem, Score, can_slip, match, mutual_overlap, 
 from jaxreg.neighbours import BruteForce
 
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
 SPACING = 0.1
 EYE = jnp.eye(4)
 

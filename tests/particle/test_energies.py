@@ -28,6 +28,9 @@ from jaxreg.particle.modes import distinct_modes, first_within
 from jaxreg.robust import L2
 
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
 N = 128
 RNG = np.random.default_rng(0)
 POINTS = blob(N, 3) - blob(N, 3).mean(0)
