@@ -4,11 +4,19 @@ import io
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxreg.io.errors import InputError
 from jaxreg.io.thinning import Step, every_row
+
+
+_BLOCK = 1_000_000  # rows that are read at a time
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 
 
 def parse_npy(
@@ -38,20 +46,20 @@ def parse_npy(
     return as_points(array[:: step(max(num, 1))] if num else array, str(path)), num
 
 
-def parse_npz(data: bytes, path: Path) -> dict[str, np.ndarray]:
+def parse_npz(path: Path, step: Step = every_row) -> dict[str, tuple[np.ndarray, int]]:
     """The arrays of an NPZ file by key, each as `parse_npy` has it.
+
+    They are read by blocks, of which only the rows that are kept stay in memory.
 
     Raises:
         InputError: if an array is none of points, or there is none.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            arrays = {
-                name.removesuffix(".npy"): np.load(
-                    io.BytesIO(archive.read(name)), allow_pickle=False
-                )
-                for name in archive.namelist()
-            }
+        arrays = {}
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                with archive.open(name) as file:
+                    arrays[name.removesuffix(".npy")] = _some_rows(file, step)
     except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error) as err:
         raise InputError(
             f"{path}: not an NPZ file of plain numbers.\n"
@@ -59,7 +67,40 @@ def parse_npz(data: bytes, path: Path) -> dict[str, np.ndarray]:
         ) from err
     if not arrays:
         raise InputError(f"{path}: holds no arrays.\nSave each scan under a name.")
-    return {key: as_points(a, f"{path}:{key}") for key, a in arrays.items()}
+    return {
+        key: (as_points(rows, f"{path}:{key}"), num)
+        for key, (rows, num) in arrays.items()
+    }
+
+
+def _some_rows(file: Any, step: Step) -> tuple[np.ndarray, int]:
+    """Of an array in the NPY format, and how many rows it has."""
+    version = np.lib.format.read_magic(file)
+    if version not in _HEADERS:
+        raise ValueError(f"version {version}")
+    shape, by_columns, dtype = _HEADERS[version](file)
+    if dtype.hasobject:
+        raise ValueError("objects")
+    if len(shape) != 2:  # for the message alone: a view of one zero
+        return np.broadcast_to(np.zeros((), dtype), shape), 0
+    num, width = shape
+    every = step(max(num, 1))
+    if not by_columns:
+        return _records(file, num, np.dtype((dtype, (width,))), every), num
+    columns = [_records(file, num, dtype, every) for _ in range(width)]
+    return np.stack(columns, axis=1), num
+
+
+def _records(file: Any, num: int, dtype: np.dtype, every: int) -> np.ndarray:
+    parts = []
+    block = every * max(1, _BLOCK // every)
+    for start in range(0, num, block):
+        count = min(block, num - start)
+        data = file.read(count * dtype.itemsize)
+        if len(data) < count * dtype.itemsize:
+            raise EOFError("cut off")
+        parts.append(np.frombuffer(data, dtype)[::every].copy())
+    return np.concatenate(parts) if parts else np.zeros(0, dtype)
 
 
 def as_points(array: np.ndarray, name: str) -> np.ndarray:

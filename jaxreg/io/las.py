@@ -7,14 +7,26 @@ import numpy as np
 
 from jaxreg.io.arrays import as_points
 from jaxreg.io.extras import reader, unreadable
+from jaxreg.io.thinning import Step, every_row
 
 
-def parse_las(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The points of a LAS or LAZ file; `path` is for messages only.
+# Points that are unpacked at a time, some 34 bytes each.
+_CHUNK = 1_000_000
+
+
+def parse_las(
+    data: bytes | None, path: Path, step: Step = every_row
+) -> tuple[np.ndarray, tuple[str, ...], int]:
+    """The points of a LAS or LAZ file, which is unpacked by chunks.
+
+    Args:
+        data: its content; None reads the file.
+        path: of the file, and for messages.
+        step: tells from the number of points which of them to keep.
 
     Returns:
         `(n, 3)` float64 (map coordinates do not fit into float32), scale and offset
-        applied; the names of the dimensions.
+        applied; the names of the dimensions; the number of points in the file.
 
     Raises:
         InputError: if the data are no whole LAS or LAZ file or hold no points.
@@ -23,12 +35,18 @@ def parse_las(data: bytes, path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     laspy = reader("laspy", "LAS and LAZ")
     reader("lazrs", "LAZ")
     try:
-        las = laspy.read(io.BytesIO(data))
-        points = np.asarray(las.xyz, dtype=np.float64)
-        fields = tuple(las.point_format.dimension_names)
-        promised = las.header.point_count
+        with laspy.open(path if data is None else io.BytesIO(data)) as file:
+            fields = tuple(file.header.point_format.dimension_names)
+            promised, found, parts = file.header.point_count, 0, []
+            every = step(max(promised, 1))
+            for chunk in file.chunk_iterator(_CHUNK):
+                first = -found % every
+                columns = [getattr(chunk, axis)[first::every] for axis in "xyz"]
+                parts.append(np.stack(columns, axis=1).astype(np.float64))
+                found += len(chunk)
     except Exception as err:  # whatever a reader meets in damaged data
         raise unreadable(path, "LAS or LAZ", err) from err
-    if len(points) != promised:
-        raise unreadable(path, "LAS or LAZ", f"{len(points)} points of {promised}")
-    return as_points(points, str(path)), fields
+    if found != promised:
+        raise unreadable(path, "LAS or LAZ", f"{found} points of {promised}")
+    points = np.concatenate(parts) if parts else np.zeros((0, 3))
+    return as_points(points, str(path)), fields, found

@@ -1,10 +1,10 @@
 """Reading point sets: one entry point that goes by the suffix of the file."""
 
-import gzip
+import contextlib
 import os
 import re
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,19 +13,25 @@ import numpy as np
 from jaxreg.io import arrays, e57, las, meshes, pcd, ply, text
 from jaxreg.io.content import require_suffix
 from jaxreg.io.errors import InputError
-from jaxreg.io.thinning import Step, at_most, some_lines
+from jaxreg.io.thinning import (
+    Step,
+    at_most,
+    every_row,
+    is_packed,
+    open_bytes,
+    some_lines,
+)
 
 
 TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
 _PARSERS = {
     ".pcd": pcd.parse_pcd,
-    ".las": las.parse_las,
-    ".laz": las.parse_las,
     ".obj": meshes.parse_obj,
     ".stl": meshes.parse_stl,
 }
 ARCHIVES = (".npz", ".e57")
-SUFFIXES = (".npy", ".ply", *_PARSERS, *ARCHIVES, *TEXT)
+_BY_PARTS = {".ply": ply.parse_ply, ".las": las.parse_las, ".laz": las.parse_las}
+SUFFIXES = (".npy", *_BY_PARTS, *_PARSERS, *ARCHIVES, *TEXT)
 _NEVER_PACKED = (".npy", *ARCHIVES, "")
 _FORMATS = (
     "PLY, XYZ/CSV/TXT text, PCD, LAS/LAZ, OBJ, STL (each also .gz), E57, NPY, NPZ"
@@ -120,8 +126,9 @@ def read_named(
 
     Args:
         path: a file as for `read_points`, an archive with or without `:KEY`.
-        max_points: of scans with more, every so many rows are kept. Of PLY, NPY and
-            text files the others are not even read into memory.
+        max_points: of scans with more, every so many rows are kept. Of PLY, LAS, LAZ,
+            NPY, NPZ and text files the others never are in memory together; of PCD,
+            OBJ, STL, E57 and of compressed files but text they are.
 
     Raises:
         InputError: as `read_points`.
@@ -129,7 +136,9 @@ def read_named(
     bare, key = _split_key(path)
     if _suffix(bare) not in ARCHIVES:
         return {stem(bare): _read_file(bare, max_points)}
-    scans = {k: _thinned(x, max_points) for k, x in _read_archive(bare).items()}
+    step = every_row if max_points is None else at_most(max_points)
+    found = _read_archive(bare, step)
+    scans = {name: _thinned(scan, max_points) for name, scan in found.items()}
     if key is None and len(scans) == 1 and _suffix(bare) == ".e57":
         return {stem(bare): next(iter(scans.values()))}  # scanners name all alike
     if key is not None and key not in scans:
@@ -175,13 +184,13 @@ def _read_file(path: Path, max_points: int | None) -> NamedPoints:
             f"{path}: unknown kind of file {suffix or '(no suffix)'}.\n"
             f"Wanted {_FORMATS}."
         )
-    packed = path.name.lower().endswith(".gz")
-    if max_points is not None and not packed and suffix in (".ply", ".npy", *TEXT):
+    by_parts = suffix in TEXT or not is_packed(path) and suffix in (".npy", *_BY_PARTS)
+    if max_points is not None and by_parts:
         return _thinned(_read_some(path, suffix, at_most(max_points)), max_points)
     data = _read_bytes(path)
     require_suffix(data, suffix, path)
-    if suffix == ".ply":
-        return _thinned(NamedPoints(*ply.parse_ply(data, path)[:2]), max_points)
+    if suffix in _BY_PARTS:
+        return _thinned(NamedPoints(*_BY_PARTS[suffix](data, path)[:2]), max_points)
     if suffix in _PARSERS:
         return _thinned(NamedPoints(*_PARSERS[suffix](data, path)), max_points)
     if suffix == ".npy":
@@ -193,13 +202,14 @@ def _read_file(path: Path, max_points: int | None) -> NamedPoints:
 def _read_some(path: Path, suffix: str, step: Step) -> NamedPoints:
     """Of a file that may be larger than the memory."""
     require_suffix(_read_bytes(path, 16), suffix, path)
-    if suffix == ".ply":
-        points, fields, num = ply.parse_ply(None, path, step)
+    if suffix in _BY_PARTS:
+        points, fields, num = _BY_PARTS[suffix](None, path, step)
         return NamedPoints(points, fields, step(num))
     if suffix == ".npy":
         points, num = arrays.parse_npy(None, path, step)
         return NamedPoints(points, step=step(num))
-    data, lines = some_lines(path)
+    with _reading(path):
+        data, lines = some_lines(path)
     return NamedPoints(text.parse_text(data, path), text.columns(data), lines)
 
 
@@ -209,21 +219,28 @@ def _thinned(scan: NamedPoints, max_points: int | None) -> NamedPoints:
     return scan._replace(points=points, step=step * scan.step)
 
 
-def _read_archive(path: Path) -> dict[str, NamedPoints]:
+def _read_archive(path: Path, step: Step) -> dict[str, NamedPoints]:
     suffix = _suffix(path)
-    data = _read_bytes(path, 16 if suffix == ".e57" else -1)
-    require_suffix(data, suffix, path)
+    require_suffix(_read_bytes(path, 16), suffix, path)
     if suffix == ".npz":
-        return {k: NamedPoints(x) for k, x in arrays.parse_npz(data, path).items()}
+        found = arrays.parse_npz(path, step)
+        return {k: NamedPoints(x, step=step(n)) for k, (x, n) in found.items()}
     return {name: NamedPoints(*scan) for name, scan in e57.read_e57(path).items()}
 
 
 def _read_bytes(path: Path, limit: int = -1) -> bytes:
+    with _reading(path), open_bytes(path) as file:
+        data = file.read(limit)
+    if not data:
+        raise InputError(f"{path}: the file is empty.\nExport or copy the scan again.")
+    return data
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Says what is wrong with a file that cannot be read."""
     try:
-        with path.open("rb") as file:
-            data = file.read(limit)
-        if path.name.lower().endswith(".gz") and data:
-            data = gzip.decompress(data)
+        yield
     except FileNotFoundError as err:
         raise InputError(f"{path}: no such file.\nCheck the name and folder.") from err
     except (OSError, EOFError, zlib.error) as err:
@@ -231,9 +248,6 @@ def _read_bytes(path: Path, limit: int = -1) -> bytes:
         raise InputError(
             f"{path}: cannot be read ({reason}).\nCheck the file and its permissions."
         ) from err
-    if not data:
-        raise InputError(f"{path}: the file is empty.\nExport or copy the scan again.")
-    return data
 
 
 def _split_key(path: str | Path) -> tuple[Path, str | None]:

@@ -12,6 +12,7 @@ import pytest
 
 from jaxreg.cli.main import main
 from jaxreg.io import InputError, MissingExtraError, read_points, read_scans
+from jaxreg.io.points import read_named
 
 
 laspy = pytest.importorskip("laspy")
@@ -197,6 +198,18 @@ def test_damaged_files_are_named_in_two_lines(tmp_path: Path, name: str):
     lines = str(caught.value).splitlines()
     assert str(path) in lines[0]
     assert len(lines) <= 2
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_of_a_large_las_every_so_many_points_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+):
+    monkeypatch.setattr("jaxreg.io.las._CHUNK", 8)
+    path = tmp_path / f"a.{suffix}"
+    _write_las(path, FAR)
+    (scan,) = read_named(path, max_points=20).values()
+    assert scan.step == 3
+    np.testing.assert_array_equal(scan.points, read_points(path)[::3])
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz", "e57"])
