@@ -313,10 +313,39 @@ def test_threads_keep_the_precision_of_the_caller():
     with jax.enable_x64(True):
         source, target, _ = _pair(3, 3, angle=0.2)
         pairs = [np.stack([x.astype(float)] * 3) for x in (source, target)]
-        T = jr.register(pairs[0], pairs[1], _Centroids()).T_target_source
+        T, again = (
+            jr.register(pairs[0], pairs[1], _Centroids(), batch_size=k).T_target_source
+            for k in (1, 2)
+        )
         assert T.dtype == np.float64
+        np.testing.assert_allclose(again, T, atol=1e-12)
         shift = pairs[1].mean(1) - pairs[0].mean(1)
         np.testing.assert_allclose(T[:, :3, 3], shift, atol=1e-12)
+
+
+def test_pairs_side_by_side_have_the_answers_and_the_memory_of_their_number():
+    method = BESL_MCKAY
+    pairs = [_pair(2, seed, angle=0.2) for seed in range(5)]
+    arrays = [np.stack(x).astype(np.float32) for x in zip(*pairs, strict=True)]
+
+    def run(batch_size: int, repeats: int = 1):
+        """Poses, and bytes beyond inputs, of which a copy is made, and outputs."""
+        many = [np.tile(x, (repeats, 1, 1)) for x in arrays]
+
+        def poses(source, target, T):
+            found = jr.register(source, target, method, T, batch_size=batch_size)
+            return found.T_target_source
+
+        program = jax.jit(poses).lower(*many).compile()
+        memory = program.memory_analysis()
+        assert memory is not None
+        copied = sum(x.nbytes for x in many)
+        return program(*many), memory.temp_size_in_bytes - copied
+
+    one, two, more = run(1), run(2), run(2, 4)
+    np.testing.assert_allclose(two[0], one[0], atol=1e-5)
+    assert one[1] < two[1] < 2 * (1e7 + 900 * (N + M))
+    assert more[1] < 1.2 * two[1]
 
 
 def test_masked_and_non_finite_rows_do_not_count():

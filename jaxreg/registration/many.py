@@ -44,6 +44,7 @@ def register_batch(
     pair: tuple[Array, ...],
     init: Array | None,
     key: Array | None,
+    batch_size: int,
 ) -> RegistrationSolution:
     """Of pairs of one size."""
     num = math.prod(batch)
@@ -62,7 +63,7 @@ def register_batch(
         return jax.tree.map(lambda x: jnp.asarray(x[rows]), every)
 
     group = np.arange(num), of_rows
-    solution = _register_groups(method, [group], impl, threads)
+    solution = _register_groups(method, [group], impl, threads, batch_size)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solution)
 
 
@@ -71,6 +72,7 @@ def register_lists(
     lists: tuple[list[Array], ...],
     init: Array | None,
     key: Array | None,
+    batch_size: int,
 ) -> RegistrationSolution:
     """Of pairs of unequal sizes, padded."""
     sources, targets, source_masks, target_masks = lists
@@ -95,7 +97,7 @@ def register_lists(
 
     sizes = np.array([[rounded_up(len(x)) for x in xs] for xs in (sources, targets)])
     groups = [group(*same) for same in _of_similar_size(sizes.T)]
-    return _register_groups(method, groups, impl, threads)
+    return _register_groups(method, groups, impl, threads, batch_size)
 
 
 def _of_similar_size(sizes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -126,17 +128,21 @@ def _on_host(arrays: _Tree) -> _Tree:
 
 
 def _register_groups(
-    method: AbstractRegistrar, groups: list[_Group], impl: Hashable, threads: bool
+    method: AbstractRegistrar,
+    groups: list[_Group],
+    impl: Hashable,
+    threads: bool,
+    batch_size: int,
 ) -> RegistrationSolution:
     """Group after group, the solutions in the order of the pairs' numbers."""
     parts = []
     for members, of_rows in groups:
 
         def some(rows: np.ndarray, of_rows: Callable = of_rows) -> RegistrationSolution:
-            return _register_rows(method, of_rows(rows), impl)
+            return _register_rows(method, of_rows(rows), impl, batch_size)
 
         every = np.arange(len(members))
-        parts.append(_over_cores(some, every) if threads else some(every))
+        parts.append(_over_cores(some, every, batch_size) if threads else some(every))
     if len(parts) == 1:
         return jax.tree.map(jnp.asarray, parts[0])
     order = np.argsort(np.concatenate([members for members, _ in groups]))
@@ -145,12 +151,15 @@ def _register_groups(
 
 
 def _over_cores(
-    register_rows: Callable[[np.ndarray], RegistrationSolution], rows: np.ndarray
+    register_rows: Callable[[np.ndarray], RegistrationSolution],
+    rows: np.ndarray,
+    batch_size: int,
 ) -> RegistrationSolution:
     """In chunks of one size, as many at a time as there are cores; NumPy arrays."""
     num, cores = len(rows), num_cores()
     chunk = max(min(num // (4 * cores), _CHUNK), 1)
     chunk = 1 << (chunk.bit_length() - 1)  # another number of pairs compiles nothing
+    chunk = min(max(chunk, batch_size), num)
 
     def run(start: int) -> RegistrationSolution:
         first = min(start, num - chunk)
@@ -163,13 +172,15 @@ def _over_cores(
 
 @compiled
 def _register_rows(
-    method: AbstractRegistrar, pairs: _Pairs, impl: Hashable
+    method: AbstractRegistrar, pairs: _Pairs, impl: Hashable, batch_size: int
 ) -> RegistrationSolution:
-    """One after another: memory stays bounded."""
+    """One group after another: memory stays bounded."""
 
     def one(pair: _Pairs) -> RegistrationSolution:
         *arrays, init, data = pair
         key = None if data is None else jax.random.wrap_key_data(data, impl=impl)
         return register_pair(method, tuple(arrays), init, key)
 
-    return lax.map(one, pairs)
+    # Groups of one would be vectorised over an axis of one: conditions become selects.
+    size = batch_size if batch_size > 1 else None
+    return lax.map(one, pairs, batch_size=size)
