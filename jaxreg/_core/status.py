@@ -37,8 +37,8 @@ start nearer to the solution.
 _ADVICE = {
     Status.CONVERGED: "Converged.",
     Status.MAX_STEPS: (
-        "The steps ran out before the answer stood still. Raise max_steps, or start "
-        "nearer to the solution."
+        "The steps ran out before the answer stood still. Raise `max_steps` (`average "
+        "--budget`), or start nearer to the solution."
     ),
     Status.DEGENERATE: (
         "The data leave some direction of the motion free (points on a line or a "
@@ -54,7 +54,8 @@ _ADVICE = {
     ),
     Status.LOW_OVERLAP: (
         "No pose was found at which enough of the two point sets agree. They may not "
-        "overlap; else raise the number of particles or give an initial guess."
+        "overlap; else draw more particles (`num_prior`, `--budget`) or give an "
+        "initial guess (`init`)."
     ),
     Status.AMBIGUOUS: (
         "Several poses agree about equally well (a symmetric object?), or surfaces "

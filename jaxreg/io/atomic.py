@@ -102,7 +102,7 @@ def require_writable(folder: str | Path) -> None:
     except OSError as err:
         raise InputError(
             f"{folder}: cannot be written ({err.strerror}).\n"
-            "Choose another output folder."
+            "Choose another folder for the results (--out)."
         ) from err
 
 
