@@ -133,7 +133,9 @@ def _averaged(
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
     agreed = jnp.where(believed(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
-    part = _confirmed_components(pairs, agreed, num_scans, _STRONG * min_overlap)
+    # Nothing could confirm the only pair of two scans: it is believed as `register` is.
+    strong = (_STRONG if num_scans > 2 else 1) * min_overlap
+    part = _confirmed_components(pairs, agreed, num_scans, strong)
     T_world_i, status, trace = solution.T_world_i[swap], solution.status, solution.trace
     return Placement(T_world_i, part, edge_weight, mode, status, trace)
 

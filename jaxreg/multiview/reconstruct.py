@@ -56,7 +56,8 @@ def reconstruct(
         viewpoints: where each scan's scanner stood, in the scan's own frame: `(v, d)`,
             or a list with None for those that are not known. A scan saw free space
             between its viewpoint and its points, and poses that put points of others
-            there count as contradicted. Only for scans from one place each.
+            there count as contradicted. Only for scans from one place each, of what
+            does not move.
         order: "sequential" if each scan overlaps the next: only neighbours are
             registered to begin with, of any number of scans, where the scanner moved on
             as before without a search; not under `jit`.

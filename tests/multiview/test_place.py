@@ -50,3 +50,12 @@ def test_without_second_modes_their_pairs_are_not_believed():
     found = place(motions, 7, None, jnp.float32(0.1))
     wrong = np.isin(range(len(PAIRS)), SECOND + LOST)
     np.testing.assert_array_equal(np.asarray(found.edge_weight) < 0.1, wrong)
+
+
+def test_the_only_pair_of_two_scans_needs_no_other_to_confirm_it():
+    T_i_j = jnp.asarray(np.linalg.inv(T_TRUE[0]) @ T_TRUE[1])[None, None]
+    weak = jnp.full((1, 1), 0.15)
+    pair = RelativeMotions(jnp.array([[0, 1]], jnp.int32), T_i_j, weak, weak)
+    for num_scans, parts in ((2, [0, 0]), (3, [0, 1, 2])):
+        found = place(pair, num_scans, None, jnp.float32(0.1))
+        np.testing.assert_array_equal(found.part, parts)
