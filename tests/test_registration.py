@@ -259,6 +259,17 @@ def test_a_hundred_sizes_compile_once(compiled):
     np.testing.assert_array_equal(sol.num_inliers, [len(s) for s in sources])
 
 
+def test_single_pairs_of_similar_sizes_share_a_program(compiled):
+    sources, targets = _ragged(100)
+    for k in (0, 20, 60):  # up to 512 and 896 rows
+        sol = jr.register(sources[k], targets[k], _Centroids())
+        shift = targets[k].mean(0) - sources[k].mean(0)
+        np.testing.assert_allclose(sol.T_target_source[:3, 3], shift, atol=1e-5)
+        assert int(sol.num_inliers) == len(sources[k])
+    assert len([name for name in compiled if "register" in name]) == 1
+    assert len(compiled) < 20
+
+
 def test_lists_of_very_different_sizes_are_grouped(monkeypatch, compiled):
     sources, targets = _ragged(9)
     sources[4] = sources[4][:5]

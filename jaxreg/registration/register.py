@@ -8,11 +8,14 @@ from jaxreg._core.checks import (
     check_key,
     check_motion,
     check_pair,
+    is_concrete,
 )
 from jaxreg._core.compile import compiled
 from jaxreg._core.padding import (
     check_lists,
     is_list_of_clouds,
+    rounded_up,
+    stacked,
 )
 from jaxreg._core.typing import Key
 from jaxreg.local import (
@@ -81,10 +84,11 @@ def register(
         As the method says.
 
     Compilation:
-        The clouds of a list are padded to the size that holds the largest source or
-        target (see `rounded_up` in `jaxreg._core.padding`), which changes an answer by
-        rounding only, so lists of similar sizes share a program. Where that would add
-        more than 2^24 rows, each pair of sizes compiles once.
+        Outside of a transformation clouds are padded to sizes rounded up (see
+        `rounded_up` in `jaxreg._core.padding`), those of a list to the one that holds
+        the largest, which changes an answer by rounding only: similar sizes share a
+        program. Where a list would get more than 2^24 rows more, each pair of sizes
+        compiles once.
 
     Memory:
         Groups of `batch_size` pairs are registered one after another on each core. On a
@@ -113,7 +117,7 @@ def register(
     batch = pair[0].shape[:-2]
     init = _check_init(init, batch, pair[0])
     if not batch:
-        return _register_one(method, pair, init, key)
+        return _register_one(method, _rounded_up(pair), init, key)
     return register_batch(method, batch, pair, init, key, batch_size)
 
 
@@ -132,6 +136,13 @@ def _check_init(
             f"init: wanted one motion or leading axes {batch} like source, found "
             f"shape {found.shape}."
         ) from err
+
+
+def _rounded_up(pair: tuple[Array, ...]) -> tuple[Array, ...]:
+    """With masked rows added to concrete arrays, so that few sizes compile."""
+    if not all(map(is_concrete, pair)):
+        return pair
+    return tuple(stacked([x], rounded_up(len(x)))[0] for x in pair)
 
 
 @compiled
