@@ -13,8 +13,8 @@ class Status(enum.IntEnum):
 
     >>> import jaxreg as jr
     >>> print(jr.Status(1).name, "-", jr.Status(1).advice)
-    MAX_STEPS - The steps ran out before the answer stood still. Raise max_steps, or \
-start nearer to the solution.
+    MAX_STEPS - The steps ran out before the answer stood still. Raise `max_steps` \
+(`average --budget`), or start nearer to the solution.
     """
 
     CONVERGED = 0
