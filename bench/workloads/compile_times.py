@@ -1,4 +1,4 @@
-"""Time to trace and compile the functions of the public face, apart from running them.
+"""First calls of the functions of the public face: tracing, compiling and one run.
 
 Caches are emptied before each call. The fixed program beside it tells how fast this
 machine and this XLA compile.
@@ -16,6 +16,7 @@ import jaxreg as jr
 from bench.case import Case, Judged, Method, Options
 from bench.workloads.local_data import draw, load
 from jaxreg.averaging import Correntropy, average
+from jaxreg.datasets import sculpture_scans
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import random_graph
 
@@ -27,11 +28,13 @@ def cases(options: Options) -> Iterator[Case]:
     X, edges, T, _wrong = random_graph(32, 465, 0.3, 0)
     graph = PoseGraph.from_edges(edges, T.astype(np.float32), len(X))
     guess = jnp.eye(4)
+    scans, key = sculpture_scans(4, seed=0)[0], jax.random.key(0)
     own: dict[str, Callable[[], Any]] = {
         "jaxreg ICP": lambda: jr.register(*clouds, jr.ICP(), guess),
+        "jaxreg ParticleFilter": lambda: jr.register(*clouds, key=key),
+        "jaxreg Correntropy": partial(average, graph, Correntropy()),
+        "jaxreg reconstruct": partial(jr.reconstruct, scans, key=key),
     }
-    own["jaxreg ParticleFilter"] = lambda: jr.register(*clouds, key=jax.random.key(0))
-    own["jaxreg Correntropy"] = partial(average, graph, Correntropy())
     methods = [Method("fixed program", "jax", "eigh, svd and a loop", _compile_fixed)]
     for name, call in own.items():
         methods.append(Method(name, "jaxreg", "first call", partial(_first, call)))
