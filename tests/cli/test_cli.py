@@ -81,6 +81,7 @@ def _fake_reconstruct(
             edge_weight=jnp.asarray(both.astype(float)),
             inlier_rmse=jnp.zeros(len(edges)),
             num_dropped=jnp.asarray([np.sum(~np.isfinite(s).all(1)) for s in scans]),
+            trace=None,
         )
 
     monkeypatch.setattr(jaxreg, "reconstruct", reconstruct)
@@ -310,6 +311,7 @@ def _register_s1_onto_s0(
         inlier_rmse=jnp.asarray(0.02),
         covariance=1e-6 * jnp.eye(6),
         modes=_modes(T),
+        trace=None,
     )
 
 
@@ -345,6 +347,7 @@ def test_register_without_overlap_exits_with_2(
             inlier_rmse=jnp.asarray(jnp.nan),
             covariance=jnp.full((6, 6), jnp.nan),
             modes=_modes(np.full((4, 4), np.nan)),
+            trace=None,
         )
 
     monkeypatch.setattr(jaxreg, "register", register)
