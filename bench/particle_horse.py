@@ -19,6 +19,7 @@ from bench.particle_data import Trials, horse, horse_model
 from bench.particle_plot import Panel, trial_figure
 from bench.particle_run import Method, Outcome, look_ups, outcome, run
 from bench.timing import timed
+from jaxreg._core.compile import compiled
 from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.geometry import lie
 from jaxreg.local import PointToPoint
@@ -88,7 +89,7 @@ class Model(NamedTuple):
     radius: Array
 
 
-@eqx.filter_jit
+@compiled
 def prepare(method: AbstractSearch, target: Array) -> Model:
     """Of `(m, 3)` points."""
     mask = jnp.ones(len(target), bool)
@@ -98,7 +99,7 @@ def prepare(method: AbstractSearch, target: Array) -> Model:
     return Model(cloud, index, centre, radius)
 
 
-@eqx.filter_jit
+@compiled
 def search(
     method: AbstractSearch, model: Model, sources: Array, key: Array
 ) -> tuple[Array, Array]:
