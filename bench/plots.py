@@ -54,6 +54,7 @@ SERIES = {
     "neighbours": Series("cpu_ms", "CPU time of all queries, ms", True, True),
     "averaging_outliers": Series("success", "right, %", False, False),
     "large_graphs": Series("cpu_ms", "CPU time, ms", True, True),
+    "multiview_size": Series("cpu_ms", "CPU time of a call, ms", True, True),
 }
 
 
@@ -88,7 +89,8 @@ def _series(series: Series, rows: list[Row], path: Path) -> Path | None:
     styles = _styles(rows)
 
     def panel(axis: Any, label: str) -> None:
-        here = [r for r in rows if r.x_label == label]
+        # In ascending order also where a case was finished by a later call.
+        here = sorted((r for r in rows if r.x_label == label), key=lambda r: r.x or 0)
         for method, style in styles.items():
             points = [
                 (r.x, r.metrics[series.metric]) for r in here if r.key.method == method
