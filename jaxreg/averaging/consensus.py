@@ -158,27 +158,40 @@ class CycleConsensus(AbstractAverager):
 
 
 def _by_long_cycles(graph: PoseGraph, found: "_Found", scale: Array) -> "_Found":
-    """With the trees that long cycles confirm as further starts."""
-    s = found.search
-    key, grow = jax.random.split(s.key)
-    odds = long_cycle_odds(graph, found.odds[0], grow)
-    likely = jnp.where(graph.weight > 0, jax.nn.sigmoid(found.odds[0]), 0)
-    T = jax.vmap(lambda o: _forest(graph, o + likely).T_world_i)(odds)
-    score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
-    best = jnp.argmax(score)
-    better = score[best] > s.score
-    search = s._replace(
-        T=jnp.where(better, T[best], s.T),
-        score=jnp.maximum(score[best], s.score),
-        settled=better & _is_settled(graph, odds, T[best], scale),
-        key=key,
-    )
-    return _Found(
-        search,
-        jnp.concatenate([found.starts, T]),
-        jnp.concatenate([found.odds, odds]),
-        jnp.where(better, odds[best], found.own),
-    )
+    """With the trees that long cycles confirm as further starts, if there is doubt."""
+
+    def grown() -> _Found:
+        s = found.search
+        key, grow = jax.random.split(s.key)
+        odds = long_cycle_odds(graph, found.odds[0], grow)
+        likely = jnp.where(graph.weight > 0, jax.nn.sigmoid(found.odds[0]), 0)
+        T = jax.vmap(lambda o: _forest(graph, o + likely).T_world_i)(odds)
+        score = jax.vmap(lambda T: coherence(graph, T, scale))(T)
+        best = jnp.argmax(score)
+        better = score[best] > s.score
+        search = s._replace(
+            T=jnp.where(better, T[best], s.T),
+            score=jnp.maximum(score[best], s.score),
+            settled=better & _is_settled(graph, odds, T[best], scale),
+            key=key,
+        )
+        return _Found(
+            search,
+            jnp.concatenate([found.starts, T]),
+            jnp.concatenate([found.odds, odds]),
+            jnp.where(better, odds[best], found.own),
+        )
+
+    def kept() -> _Found:
+        # Nothing looks at the rows that are added.
+        shapes = jax.eval_shape(grown)
+        starts = jnp.resize(found.starts, shapes.starts.shape)
+        return _Found(
+            found.search, starts, jnp.resize(found.odds, shapes.odds.shape), found.own
+        )
+
+    # Under a caller's `jit` also graphs that are settled come here.
+    return jax.lax.cond(found.search.settled, kept, grown)
 
 
 class _Search(NamedTuple):
