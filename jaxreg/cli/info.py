@@ -102,10 +102,13 @@ def _lines(scan: ScanFacts) -> list[str]:
         )
         if found
     ]
+    about = "about " if scan.step > 1 else ""
     lines = [
-        f"  {scan.num_points:,} points, {scan.dtype}"
+        f"  {about}{scan.num_points:,} points, {scan.dtype}"
         + (f", with {' and '.join(extras)}" if extras else "")
     ]
+    if scan.step > 1:
+        lines.append(f"  large: one of {scan.step} points was looked at")
     if scan.fields:
         lines.append(f"  columns: {' '.join(scan.fields)}")
     for axis, low, high in zip("xyz", scan.low, scan.high, strict=False):
@@ -115,7 +118,8 @@ def _lines(scan: ScanFacts) -> list[str]:
         span = f"{low:.{digits}f} to {high:.{digits}f}"
         lines.append(f"  {axis}: {span}, extent {high - low:.4g}")
     if scan.spacing is not None:
-        lines.append(f"  median spacing: {scan.spacing:.3g}")
+        most = "at most " if scan.step > 1 else ""
+        lines.append(f"  median spacing: {most}{scan.spacing:.3g}")
     if scan.non_finite:
         lines.append(f"  {scan.non_finite:.2%} of the rows hold NaN or inf")
     if scan.hint:

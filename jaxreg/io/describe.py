@@ -16,6 +16,7 @@ from jaxreg.io.points import NamedPoints, read_named
 from jaxreg.io.toro import read_toro
 
 
+_MAX_POINTS = 5_000_000
 GRAPHS = (".g2o", ".g2o.gz", ".graph")
 # As PLY, PCD and E57 call them, in lower case.
 _NORMALS = (
@@ -38,14 +39,15 @@ class ScanFacts:
 
     Attributes:
         name: of the file, or the key within an archive.
-        num_points: rows, those with NaN or inf included.
+        num_points: rows, those with NaN or inf included; about, if `step` is over 1.
+        step: of how many rows of a large file one was looked at.
         dim: 2 or 3.
         dtype: float32 or float64, as `read_points` has it.
         fields: names of the columns or properties, empty if the file names none.
         low: `(d,)` least coordinates of the finite rows; empty without such rows.
         high: `(d,)` largest.
         spacing: median distance to the nearest other point, on a part of the points;
-            None with fewer than two distinct ones.
+            of a large file larger than in it; None with fewer than two distinct points.
         non_finite: share of the rows with NaN or inf.
         has_normals: whether the fields hold normals.
         has_colors: whether the fields hold colours.
@@ -54,6 +56,7 @@ class ScanFacts:
 
     name: str
     num_points: int
+    step: int
     dim: int
     dtype: str
     fields: tuple[str, ...]
@@ -85,13 +88,15 @@ class GraphFacts:
 def describe(path: str | Path) -> list[ScanFacts] | GraphFacts:
     """Reads a file and tells what is in it; lengths in the unit of the file.
 
+    Of scans with more than five million points some are looked at.
+
     Raises:
         InputError: if the file cannot be read or its kind is unknown.
         MissingExtraError: if a package that is needed for it is not installed.
     """
     if str(path).lower().endswith(GRAPHS):
         return _graph(Path(path))
-    return [_scan(name, scan) for name, scan in read_named(path).items()]
+    return [_scan(name, scan) for name, scan in read_named(path, _MAX_POINTS).items()]
 
 
 def unit_notes(facts: Sequence[tuple[str, ScanFacts]]) -> list[str]:
@@ -122,7 +127,8 @@ def _scan(name: str, scan: NamedPoints) -> ScanFacts:
     spacing = _spacing(finite)
     return ScanFacts(
         name=name,
-        num_points=len(points),
+        num_points=len(points) * scan.step,
+        step=scan.step,
         dim=points.shape[1],
         dtype=str(points.dtype),
         fields=scan.fields,

@@ -58,6 +58,18 @@ def test_spacing_of_many_points_is_that_of_all(capsys: pytest.CaptureFixture[str
     assert (scan["num_points"], scan["dim"], scan["spacing"]) == (550**2, 2, 0.25)
 
 
+def test_of_a_large_scan_some_points_are_looked_at(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("jaxreg.io.describe._MAX_POINTS", 500)
+    np.save("a.npy", GRID)
+    (scan,) = _json(capsys, "a.npy")["files"][0]["scans"]
+    assert (scan["num_points"], scan["step"]) == (1728, 4)
+    assert main(["info", "a.npy"]) == 0
+    text = capsys.readouterr().out
+    assert "about 1,728 points, float64\n  large: one of 4 points was" in text
+
+
 def test_normals_colours_and_columns_are_named(capsys: pytest.CaptureFixture[str]):
     names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
     vertex = np.zeros(5, dtype=[(n, "u1" if len(n) > 2 else "f4") for n in names])
