@@ -32,8 +32,8 @@ def parse_text(data: bytes, path: Path) -> np.ndarray:
     start = _first_row(numbered, path)
     separator = _separator(numbered[start][1])
     columns = _numeric_columns(numbered[start][1], separator)[:3]
-    rows = [_parse_row(s, separator, columns, k, path) for k, s in numbered[start:]]
-    return np.array(rows, dtype=np.float64)
+    rows = (_parse_row(s, separator, columns, k, path) for k, s in numbered[start:])
+    return np.fromiter(rows, dtype=(np.float64, len(columns)))
 
 
 def columns(data: bytes) -> tuple[str, ...]:
