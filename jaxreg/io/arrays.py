@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from jaxreg.io.errors import InputError
-from jaxreg.io.thinning import Step, every_row
+from jaxreg.io.thinning import Step, every_row, records
 
 
-_BLOCK = 1_000_000  # rows that are read at a time
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -21,8 +20,8 @@ _HEADERS = {
 
 def parse_npy(
     data: bytes | None, path: Path, step: Step = every_row
-) -> tuple[np.ndarray, int]:
-    """The points of an NPY file, `(n, d)`, and the number of rows of the file.
+) -> tuple[np.ndarray, tuple[str, ...], int]:
+    """The points of an NPY file, `(n, d)`, no names, and of how many one was kept.
 
     Args:
         data: its content; None maps the file into memory.
@@ -42,11 +41,13 @@ def parse_npy(
             f"{path}: not a NumPy file of plain numbers.\n"
             "Save it with numpy.save as one float array of shape (n, 3) or (n, 2)."
         ) from err
-    num = array.shape[0] if array.ndim else 0
-    return as_points(array[:: step(max(num, 1))] if num else array, str(path)), num
+    every = step(max(len(array), 1)) if array.ndim else 1
+    return as_points(array[::every] if array.ndim else array, str(path)), (), every
 
 
-def parse_npz(path: Path, step: Step = every_row) -> dict[str, tuple[np.ndarray, int]]:
+def parse_npz(
+    path: Path, step: Step = every_row
+) -> dict[str, tuple[np.ndarray, tuple[str, ...], int]]:
     """The arrays of an NPZ file by key, each as `parse_npy` has it.
 
     They are read by blocks, of which only the rows that are kept stay in memory.
@@ -68,13 +69,13 @@ def parse_npz(path: Path, step: Step = every_row) -> dict[str, tuple[np.ndarray,
     if not arrays:
         raise InputError(f"{path}: holds no arrays.\nSave each scan under a name.")
     return {
-        key: (as_points(rows, f"{path}:{key}"), num)
-        for key, (rows, num) in arrays.items()
+        key: (as_points(rows, f"{path}:{key}"), (), every)
+        for key, (rows, every) in arrays.items()
     }
 
 
 def _some_rows(file: Any, step: Step) -> tuple[np.ndarray, int]:
-    """Of an array in the NPY format, and how many rows it has."""
+    """Of an array in the NPY format, and of how many one was kept."""
     version = np.lib.format.read_magic(file)
     if version not in _HEADERS:
         raise ValueError(f"version {version}")
@@ -82,25 +83,13 @@ def _some_rows(file: Any, step: Step) -> tuple[np.ndarray, int]:
     if dtype.hasobject:
         raise ValueError("objects")
     if len(shape) != 2:  # for the message alone: a view of one zero
-        return np.broadcast_to(np.zeros((), dtype), shape), 0
+        return np.broadcast_to(np.zeros((), dtype), shape), 1
     num, width = shape
     every = step(max(num, 1))
     if not by_columns:
-        return _records(file, num, np.dtype((dtype, (width,))), every), num
-    columns = [_records(file, num, dtype, every) for _ in range(width)]
-    return np.stack(columns, axis=1), num
-
-
-def _records(file: Any, num: int, dtype: np.dtype, every: int) -> np.ndarray:
-    parts = []
-    block = every * max(1, _BLOCK // every)
-    for start in range(0, num, block):
-        count = min(block, num - start)
-        data = file.read(count * dtype.itemsize)
-        if len(data) < count * dtype.itemsize:
-            raise EOFError("cut off")
-        parts.append(np.frombuffer(data, dtype)[::every].copy())
-    return np.concatenate(parts) if parts else np.zeros(0, dtype)
+        return records(file, num, np.dtype((dtype, (width,))), every), every
+    columns = [records(file, num, dtype, every) for _ in range(width)]
+    return np.stack(columns, axis=1), every
 
 
 def as_points(array: np.ndarray, name: str) -> np.ndarray:

@@ -26,7 +26,7 @@ def parse_las(
 
     Returns:
         `(n, 3)` float64 (map coordinates do not fit into float32), scale and offset
-        applied; the names of the dimensions; the number of points in the file.
+        applied; the names of the dimensions; of how many points one was kept.
 
     Raises:
         InputError: if the data are no whole LAS or LAZ file or hold no points.
@@ -49,4 +49,4 @@ def parse_las(
     if found != promised:
         raise unreadable(path, "LAS or LAZ", f"{found} points of {promised}")
     points = np.concatenate(parts) if parts else np.zeros((0, 3))
-    return as_points(points, str(path)), fields, found
+    return as_points(points, str(path)), fields, every

@@ -25,8 +25,8 @@ def parse_ply(
 
     Returns:
         `(n, d)` float32 unless the file stores float64 coordinates, 2D if the vertices
-        have no property z; the names of the properties of a vertex; the number of
-        vertices in the file.
+        have no property z; the names of the properties of a vertex; of how many
+        vertices one was kept.
 
     Raises:
         InputError: if the data are no PLY file or hold no vertices.
@@ -38,7 +38,8 @@ def parse_ply(
         vertex = plyfile.PlyData.read(file)["vertex"].data
         fields = tuple(vertex.dtype.names or ())
         names = ("x", "y", "z") if "z" in fields else ("x", "y")
-        columns = [np.asarray(vertex[name][:: step(len(vertex))]) for name in names]
+        every = step(max(len(vertex), 1))
+        columns = [np.asarray(vertex[name][::every]) for name in names]
     except (plyfile.PlyParseError, ValueError, KeyError, EOFError, TypeError) as err:
         raise InputError(
             f"{path}: not a complete PLY file with vertices x, y, z ({_short(err)}).\n"
@@ -48,7 +49,7 @@ def parse_ply(
         raise InputError(f"{path}: holds no points.\nExport or copy the scan again.")
     wide = any(c.dtype.kind != "f" or c.dtype.itemsize > 4 for c in columns)
     points = np.stack(columns, axis=1).astype(np.float64 if wide else np.float32)
-    return points, fields, len(vertex)
+    return points, fields, every
 
 
 def write_ply(

@@ -25,13 +25,17 @@ from jaxreg.io.thinning import (
 
 TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
 _PARSERS = {
+    ".npy": arrays.parse_npy,
+    ".ply": ply.parse_ply,
     ".pcd": pcd.parse_pcd,
+    ".las": las.parse_las,
+    ".laz": las.parse_las,
     ".obj": meshes.parse_obj,
     ".stl": meshes.parse_stl,
 }
-ARCHIVES = (".npz", ".e57")
-_BY_PARTS = {".ply": ply.parse_ply, ".las": las.parse_las, ".laz": las.parse_las}
-SUFFIXES = (".npy", *_BY_PARTS, *_PARSERS, *ARCHIVES, *TEXT)
+_ARCHIVE_READERS = {".npz": arrays.parse_npz, ".e57": e57.read_e57}
+ARCHIVES = tuple(_ARCHIVE_READERS)
+SUFFIXES = (*_PARSERS, *ARCHIVES, *TEXT)
 _NEVER_PACKED = (".npy", *ARCHIVES, "")
 _FORMATS = (
     "PLY, XYZ/CSV/TXT text, PCD, LAS/LAZ, OBJ, STL (each also .gz), E57, NPY, NPZ"
@@ -126,9 +130,9 @@ def read_named(
 
     Args:
         path: a file as for `read_points`, an archive with or without `:KEY`.
-        max_points: of scans with more, every so many rows are kept. Of PLY, LAS, LAZ,
-            NPY, NPZ and text files the others never are in memory together; of PCD,
-            OBJ, STL, E57 and of compressed files but text they are.
+        max_points: of scans with more, every so many rows are kept. The others never
+            are in memory together, but for compressed files (`.gz` that is not text,
+            `binary_compressed` PCD) and meshes of less than 100 MB.
 
     Raises:
         InputError: as `read_points`.
@@ -184,33 +188,18 @@ def _read_file(path: Path, max_points: int | None) -> NamedPoints:
             f"{path}: unknown kind of file {suffix or '(no suffix)'}.\n"
             f"Wanted {_FORMATS}."
         )
-    by_parts = suffix in TEXT or not is_packed(path) and suffix in (".npy", *_BY_PARTS)
-    if max_points is not None and by_parts:
-        return _thinned(_read_some(path, suffix, at_most(max_points)), max_points)
-    data = _read_bytes(path)
-    require_suffix(data, suffix, path)
-    if suffix in _BY_PARTS:
-        return _thinned(NamedPoints(*_BY_PARTS[suffix](data, path)[:2]), max_points)
-    if suffix in _PARSERS:
-        return _thinned(NamedPoints(*_PARSERS[suffix](data, path)), max_points)
-    if suffix == ".npy":
-        return NamedPoints(arrays.parse_npy(data, path)[0])
-    found = NamedPoints(text.parse_text(data, path), text.columns(data))
-    return _thinned(found, max_points)
-
-
-def _read_some(path: Path, suffix: str, step: Step) -> NamedPoints:
-    """Of a file that may be larger than the memory."""
     require_suffix(_read_bytes(path, 16), suffix, path)
-    if suffix in _BY_PARTS:
-        points, fields, num = _BY_PARTS[suffix](None, path, step)
-        return NamedPoints(points, fields, step(num))
-    if suffix == ".npy":
-        points, num = arrays.parse_npy(None, path, step)
-        return NamedPoints(points, step=step(num))
-    with _reading(path):
-        data, lines = some_lines(path)
-    return NamedPoints(text.parse_text(data, path), text.columns(data), lines)
+    if suffix in TEXT:
+        with _reading(path):
+            data, every = (
+                some_lines(path) if max_points is not None else (_read_bytes(path), 1)
+            )
+        found = NamedPoints(text.parse_text(data, path), text.columns(data), every)
+    else:
+        data = _read_bytes(path) if is_packed(path) else None
+        step = every_row if max_points is None else at_most(max_points)
+        found = NamedPoints(*_PARSERS[suffix](data, path, step))
+    return _thinned(found, max_points)
 
 
 def _thinned(scan: NamedPoints, max_points: int | None) -> NamedPoints:
@@ -222,10 +211,8 @@ def _thinned(scan: NamedPoints, max_points: int | None) -> NamedPoints:
 def _read_archive(path: Path, step: Step) -> dict[str, NamedPoints]:
     suffix = _suffix(path)
     require_suffix(_read_bytes(path, 16), suffix, path)
-    if suffix == ".npz":
-        found = arrays.parse_npz(path, step)
-        return {k: NamedPoints(x, step=step(n)) for k, (x, n) in found.items()}
-    return {name: NamedPoints(*scan) for name, scan in e57.read_e57(path).items()}
+    found = _ARCHIVE_READERS[suffix](path, step)
+    return {name: NamedPoints(*scan) for name, scan in found.items()}
 
 
 def _read_bytes(path: Path, limit: int = -1) -> bytes:

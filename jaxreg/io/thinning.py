@@ -3,9 +3,11 @@
 import gzip
 import io
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
+
+import numpy as np
 
 
 #: From the number of rows of a file to the distance of those that are kept.
@@ -15,6 +17,7 @@ Step: TypeAlias = Callable[[int], int]
 _MOST_TEXT = 100_000_000
 _HEAD = 100
 _BLOCK = 1 << 24
+_ROWS = 1_000_000  # that are read at a time
 
 
 def every_row(num: int) -> int:
@@ -55,3 +58,34 @@ def some_lines(path: Path) -> tuple[bytes, int]:
     with open_bytes(path) as file:
         head = list(itertools.islice(file, _HEAD))
         return b"".join([*head, *itertools.islice(file, 0, None, step)]), step
+
+
+def records(file: Any, num: int, dtype: np.dtype, every: int) -> np.ndarray:
+    """One of every so many of the next records of a binary file, read by blocks.
+
+    Raises:
+        EOFError: if the file ends before.
+    """
+    parts = []
+    block = every * max(1, _ROWS // every)
+    for start in range(0, num, block):
+        count = min(block, num - start)
+        data = file.read(count * dtype.itemsize)
+        if len(data) < count * dtype.itemsize:
+            raise EOFError("cut off")
+        parts.append(np.frombuffer(data, dtype)[::every].copy())
+    return np.concatenate(parts) if parts else np.zeros(0, dtype)
+
+
+def number_rows(lines: Iterable[bytes], places: Sequence[int]) -> np.ndarray:
+    """The numbers at these places of lines of words, `(n, len(places))` float64.
+
+    Raises:
+        ValueError: if a line has no number there.
+    """
+    lines = iter(lines)
+    first = list(itertools.islice(lines, 1))
+    if not first:
+        return np.zeros((0, len(places)))
+    every_line = itertools.chain(first, lines)
+    return np.loadtxt(every_line, usecols=places, ndmin=2)

@@ -18,7 +18,7 @@ from jaxreg.io.points import read_named
 laspy = pytest.importorskip("laspy")
 pye57 = pytest.importorskip("pye57")
 trimesh = pytest.importorskip("trimesh")
-pytest.importorskip("pypcd4")
+pypcd4 = pytest.importorskip("pypcd4")
 
 # Numbers that float32 holds, as some writers know nothing else.
 CLOUD = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32).astype(float)
@@ -200,16 +200,51 @@ def test_damaged_files_are_named_in_two_lines(tmp_path: Path, name: str):
     assert len(lines) <= 2
 
 
-@pytest.mark.parametrize("suffix", ["las", "laz"])
-def test_of_a_large_las_every_so_many_points_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+@pytest.mark.parametrize("kind", ["las", "laz", "e57", "ascii", "binary", "packed"])
+def test_of_large_scans_every_so_many_points_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ):
-    monkeypatch.setattr("jaxreg.io.las._CHUNK", 8)
+    for chunk in ("las._CHUNK", "e57._CHUNK", "thinning._ROWS"):
+        monkeypatch.setattr(f"jaxreg.io.{chunk}", 8)
+    suffix = kind if kind in ("las", "laz", "e57") else "pcd"
     path = tmp_path / f"a.{suffix}"
-    _write_las(path, FAR)
+    if suffix == "pcd":
+        encoding = "binary_compressed" if kind == "packed" else kind
+        cloud = pypcd4.pypcd4.PointCloud.from_xyz_points(CLOUD.astype(np.float32))
+        cloud.save(path, encoding=pypcd4.pypcd4.Encoding(encoding))
+    elif suffix == "e57":
+        _write_e57(path, ["a"], (0.6, 0, 0.8, 0))
+    else:
+        _write_las(path, FAR)
     (scan,) = read_named(path, max_points=20).values()
     assert scan.step == 3
     np.testing.assert_array_equal(scan.points, read_points(path)[::3])
+
+
+@pytest.mark.parametrize("kind", ["obj", "stl", "stl_ascii"])
+def test_of_large_meshes_some_vertices_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+):
+    monkeypatch.setattr("jaxreg.io.meshes._LARGE", 1000)
+    ball = trimesh.creation.icosphere(2, 2.0)
+    ball.faces = np.random.default_rng(0).permutation(ball.faces)
+    path = tmp_path / f"a.{kind[:3]}"
+    ball.export(path, file_type=kind)
+    (scan,) = read_named(path, max_points=60).values()
+    assert len(scan.points) <= 60
+    assert len(scan.points) >= 0.5 * 60
+    corners = {row.tobytes() for row in read_points(path)}
+    assert {row.tobytes() for row in scan.points} <= corners
+
+
+def test_points_that_the_scanner_marked_as_invalid_are_left_out(tmp_path: Path):
+    data = {f"cartesian{a}": x.copy() for a, x in zip("XYZ", CLOUD.T, strict=True)}
+    marked = np.arange(len(CLOUD)) % 4 == 1
+    data["cartesianInvalidState"] = marked.astype(np.int8)
+    with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
+        file.write_scan_raw(data)
+    points = read_points(tmp_path / "a.e57")
+    np.testing.assert_array_equal(points, CLOUD[~marked])
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz", "e57"])

@@ -212,7 +212,7 @@ def test_of_large_scans_every_so_many_points_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ):
     monkeypatch.setattr("jaxreg.io.thinning._MOST_TEXT", 8_000)
-    monkeypatch.setattr("jaxreg.io.arrays._BLOCK", 170)
+    monkeypatch.setattr("jaxreg.io.thinning._ROWS", 170)
     points = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
     path = tmp_path / f"scan{suffix}"
     if suffix == ".npy":
