@@ -4,6 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -287,6 +288,26 @@ def test_lists_of_very_different_sizes_are_grouped(monkeypatch, compiled):
     np.testing.assert_allclose(sol.T_target_source[:, :3, 3], shift, atol=1e-5)
     inside = jax.jit(lambda s, t: jr.register(s, t, _Centroids()).T_target_source)
     np.testing.assert_allclose(inside(sources, targets), sol.T_target_source, atol=1e-6)
+
+
+def test_progress_over_many_pairs_rises_to_their_number():
+    calls = []
+
+    def run(sources, targets):
+        method, hear = _Centroids(), lambda *call: calls.append(call)
+        return jr.register(sources, targets, method, progress=hear).T_target_source
+
+    sources, targets = _ragged(20)
+    run(sources, targets)
+    stages, done, totals = zip(*calls, strict=True)
+    assert set(stages) == {"registering pairs"}
+    assert set(totals) == {20}
+    assert (done[0], done[-1]) == (0, 20)
+    assert len(done) > 3
+    assert all(a < b for a, b in pairwise(done))
+    calls.clear()
+    jax.jit(run)(sources, targets)
+    assert not calls
 
 
 @pytest.mark.parametrize("name", ["filter", "icp"])

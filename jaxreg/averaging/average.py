@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import overload
 
-from jaxreg._core.typing import Key
+from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.correntropy import Correntropy
 from jaxreg.averaging.gauge import average_graph
@@ -19,6 +19,7 @@ def average(
     key: Key | None = None,
     *,
     batch_size: int = 1,
+    progress: Progress | None = None,
 ) -> AveragingSolution: ...
 
 
@@ -30,6 +31,7 @@ def average(
     key: Key | None = None,
     *,
     batch_size: int = 1,
+    progress: Progress | None = None,
 ) -> list[AveragingSolution]: ...
 
 
@@ -40,6 +42,7 @@ def average(
     key: Key | None = None,
     *,
     batch_size: int = 1,
+    progress: Progress | None = None,
 ) -> AveragingSolution | list[AveragingSolution]:
     """Finds poses that agree with relative motions: `T_i_j = inv(T_world_i) T_world_j`.
 
@@ -66,6 +69,8 @@ def average(
             graphs gets one key each by splitting.
         batch_size: graphs of a list that are averaged side by side. On a CPU one after
             another is quickest; memory grows with it.
+        progress: called as `progress(stage, done, total)` as some graphs of a list are
+            done; not for one graph, not under `jit`.
 
     Returns:
         An `AveragingSolution`; a list of them for a list. Status DISCONNECTED: some
@@ -95,6 +100,6 @@ def average(
     if batch_size < 1:
         raise ValueError(f"batch_size: wanted at least 1, found {batch_size}.")
     if isinstance(graph, list | tuple):
-        return average_list(graph, method, init, key, batch_size)
+        return average_list(graph, method, init, key, batch_size, progress)
     one = check_graph(graph, "graph")
     return average_graph(one, method, check_init(init, one, "init"), key)

@@ -1,8 +1,7 @@
 """Many graphs of unequal sizes: padded to few sizes, some side by side."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,8 @@ from jaxtyping import Array, Float
 from jaxreg._core.checks import as_float_array, is_concrete
 from jaxreg._core.compile import compiled
 from jaxreg._core.padding import rounded_up, stacked
-from jaxreg._core.typing import Key
+from jaxreg._core.progress import tell
+from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
 from jaxreg.graph.pose_graph import PoseGraph
@@ -21,6 +21,9 @@ from jaxreg.graph.pose_graph import PoseGraph
 
 # The least sizes that graphs are padded to.
 _LEAST_POSES, _LEAST_EDGES = 8, 16
+_STAGE = "averaging graphs"
+# Graphs in one call of a compiled program.
+_PIECE = 64
 
 
 def check_graph(graph: object, name: str) -> PoseGraph:
@@ -52,25 +55,42 @@ def average_list(
     init: object,
     key: Key | None,
     batch_size: int,
+    progress: Progress | None,
 ) -> list[AveragingSolution]:
     """`average` of each; graphs of similar sizes share a program."""
     checked = _check_alike(graphs)
     inits = _check_inits(init, checked)
     keys = None if key is None else jax.random.split(key, len(checked))
-    sizes = np.array([rounded_up(g.num_poses, _LEAST_POSES) for g in checked])
-    out: list[Any] = [None] * len(checked)
-    for num_poses in np.unique(sizes):
-        rows = np.flatnonzero(sizes == num_poses)
+    out: dict[int, AveragingSolution] = {}
+    tell(progress, _STAGE, 0, len(checked), checked, inits, keys)
+    for rows, padded_to in _pieces(checked, batch_size):
         some = [checked[k] for k in rows]
         starts = None if inits is None else [inits[k] for k in rows]
-        lanes = _padded(some, starts, int(num_poses))
+        lanes = _padded(some, starts, *padded_to)
         own_keys = None if keys is None else keys[rows]
         found = _average_lanes(method, *lanes, own_keys, batch_size)
         if is_concrete(found.status):
             found = jax.tree.map(np.asarray, found)  # slices compile nothing
-        for lane, k in enumerate(rows):
-            out[k] = _cut(found, lane, checked[k])
-    return out
+        out |= {k: _cut(found, lane, checked[k]) for lane, k in enumerate(rows)}
+        tell(progress, _STAGE, len(out), len(checked), found)
+    return [out[k] for k in range(len(checked))]
+
+
+def _pieces(
+    graphs: list[PoseGraph], batch_size: int
+) -> Iterator[tuple[np.ndarray, tuple[int, int]]]:
+    """Graphs that are averaged in one call, and the poses and edges they get.
+
+    Of one size all pieces have as many, the last one some of the one before.
+    """
+    sizes = np.array([rounded_up(g.num_poses, _LEAST_POSES) for g in graphs])
+    for num_poses in np.unique(sizes):
+        rows = np.flatnonzero(sizes == num_poses)
+        num_edges = rounded_up(max(graphs[k].num_edges for k in rows), _LEAST_EDGES)
+        piece = min(max(_PIECE, batch_size), len(rows))
+        for start in range(0, len(rows), piece):
+            first = min(start, len(rows) - piece)
+            yield rows[first : first + piece], (int(num_poses), num_edges)
 
 
 def _check_alike(graphs: Sequence[object]) -> list[PoseGraph]:
@@ -110,11 +130,9 @@ def _check_inits(init: object, graphs: list[PoseGraph]) -> list[Array] | None:
 
 
 def _padded(
-    graphs: list[PoseGraph], inits: list[Array] | None, num_poses: int
+    graphs: list[PoseGraph], inits: list[Array] | None, num_poses: int, num_edges: int
 ) -> tuple[PoseGraph, Array, Array | None]:
     """Graphs with a leading axis, which frames they have, and their starts."""
-    num_edges = rounded_up(max(g.num_edges for g in graphs), _LEAST_EDGES)
-
     # Built from a tree: fields with a leading axis are no PoseGraph's.
     same = [dataclasses.replace(g, num_poses=num_poses) for g in graphs]
     batch = jax.tree.map(lambda *x: stacked(x, num_edges), *same)

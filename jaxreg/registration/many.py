@@ -1,7 +1,7 @@
 """Many pairs: in groups of one size, in chunks over the cores of a CPU."""
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from typing import TypeVar
 
 import jax
@@ -18,7 +18,9 @@ from jaxreg._core.padding import (
     rounded_up,
     stacked,
 )
+from jaxreg._core.progress import tell
 from jaxreg._core.threads import map_in_threads, num_cores
+from jaxreg._core.typing import Progress
 from jaxreg.local import (
     AbstractRegistrar,
     RegistrationSolution,
@@ -26,6 +28,7 @@ from jaxreg.local import (
 from jaxreg.registration.pair import register_pair
 
 
+_STAGE = "registering pairs"
 # Pairs in one call of a compiled program: less than a few are slowed by calling it.
 _CHUNK = 8
 # Rows of padding that cost as much time as compiling another program, some seconds.
@@ -45,6 +48,7 @@ def register_batch(
     init: Array | None,
     key: Array | None,
     batch_size: int,
+    progress: Progress | None,
 ) -> RegistrationSolution:
     """Of pairs of one size."""
     num = math.prod(batch)
@@ -54,6 +58,7 @@ def register_batch(
         return x.reshape(num, *x.shape[len(batch) :])
 
     every = (*map(flat, pair), None if init is None else flat(init), data)
+    tell(progress, _STAGE, 0, num, every)
     threads = num > 0 and _in_threads(method, every)
     every = _on_host(every) if threads else every
 
@@ -63,7 +68,7 @@ def register_batch(
         return jax.tree.map(lambda x: jnp.asarray(x[rows]), every)
 
     group = np.arange(num), of_rows
-    solution = _register_groups(method, [group], impl, threads, batch_size)
+    solution = _register_groups(method, [group], impl, threads, batch_size, progress)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solution)
 
 
@@ -73,10 +78,12 @@ def register_lists(
     init: Array | None,
     key: Array | None,
     batch_size: int,
+    progress: Progress | None,
 ) -> RegistrationSolution:
     """Of pairs of unequal sizes, padded."""
     sources, targets, source_masks, target_masks = lists
     data, impl = _split(key, len(sources))
+    tell(progress, _STAGE, 0, len(sources), lists, init, data)
     threads = _in_threads(method, (lists, init, data))
     each = _on_host((init, data)) if threads else (init, data)
 
@@ -97,7 +104,7 @@ def register_lists(
 
     sizes = np.array([[rounded_up(len(x)) for x in xs] for xs in (sources, targets)])
     groups = [group(*same) for same in _of_similar_size(sizes.T)]
-    return _register_groups(method, groups, impl, threads, batch_size)
+    return _register_groups(method, groups, impl, threads, batch_size, progress)
 
 
 def _of_similar_size(sizes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -133,16 +140,20 @@ def _register_groups(
     impl: Hashable,
     threads: bool,
     batch_size: int,
+    progress: Progress | None,
 ) -> RegistrationSolution:
     """Group after group, the solutions in the order of the pairs' numbers."""
-    parts = []
+    parts, done, total = [], 0, sum(len(members) for members, _ in groups)
     for members, of_rows in groups:
 
         def some(rows: np.ndarray, of_rows: Callable = of_rows) -> RegistrationSolution:
             return _register_rows(method, of_rows(rows), impl, batch_size)
 
-        every = np.arange(len(members))
-        parts.append(_over_cores(some, every, batch_size) if threads else some(every))
+        rows = np.arange(len(members))
+        for part in _over_cores(some, rows, batch_size) if threads else [some(rows)]:
+            parts.append(part)
+            done += len(part.status)
+            tell(progress, _STAGE, done, total, part)
     if len(parts) == 1:
         return jax.tree.map(jnp.asarray, parts[0])
     order = np.argsort(np.concatenate([members for members, _ in groups]))
@@ -154,7 +165,7 @@ def _over_cores(
     register_rows: Callable[[np.ndarray], RegistrationSolution],
     rows: np.ndarray,
     batch_size: int,
-) -> RegistrationSolution:
+) -> Iterator[RegistrationSolution]:
     """In chunks of one size, as many at a time as there are cores; NumPy arrays."""
     num, cores = len(rows), num_cores()
     chunk = max(min(num // (4 * cores), _CHUNK), 1)
@@ -166,8 +177,7 @@ def _over_cores(
         found = register_rows(rows[first : first + chunk])
         return jax.tree.map(lambda x: np.asarray(x)[start - first :], found)
 
-    parts = map_in_threads(run, range(0, num, chunk), cores)
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return map_in_threads(run, range(0, num, chunk), cores)
 
 
 @compiled

@@ -17,7 +17,7 @@ from jaxreg._core.padding import (
     rounded_up,
     stacked,
 )
-from jaxreg._core.typing import Key
+from jaxreg._core.typing import Key, Progress
 from jaxreg.local import (
     AbstractRegistrar,
     RegistrationSolution,
@@ -37,6 +37,7 @@ def register(
     source_mask: object = None,
     target_mask: object = None,
     batch_size: int = 1,
+    progress: Progress | None = None,
 ) -> RegistrationSolution:
     """Registers a source point set to a target, or many pairs of them.
 
@@ -68,6 +69,8 @@ def register(
         target_mask: `(m,)` likewise.
         batch_size: of many pairs, those that a core or an accelerator registers side by
             side. On a CPU one after another is quickest; memory grows with it.
+        progress: called as `progress(stage, done, total)` as some of many pairs are
+            done, on an accelerator all of a size; not for one pair, not under `jit`.
 
     Returns:
         A `RegistrationSolution`, with leading axes for a batch and one for a list.
@@ -112,13 +115,13 @@ def register(
         lists = check_lists(source, target, *masks)
         batch = (len(lists[0]),)
         init = _check_init(init, batch, lists[0][0])
-        return register_lists(method, lists, init, key, batch_size)
+        return register_lists(method, lists, init, key, batch_size, progress)
     pair = check_pair(source, target, *masks)
     batch = pair[0].shape[:-2]
     init = _check_init(init, batch, pair[0])
     if not batch:
         return _register_one(method, _rounded_up(pair), init, key)
-    return register_batch(method, batch, pair, init, key, batch_size)
+    return register_batch(method, batch, pair, init, key, batch_size, progress)
 
 
 def _check_init(

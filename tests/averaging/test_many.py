@@ -81,7 +81,7 @@ def test_a_graph_without_valid_edges_has_its_status_and_the_others_their_poses()
 
 def test_memory_grows_with_the_batch_that_is_asked_for():
     graphs = _graphs([(10, 30)] * 32, outliers=0.0)
-    lanes = many._padded(graphs, None, 10)
+    lanes = many._padded(graphs, None, 10, 32)
 
     def size(batch_size: int) -> int:
         def run(graph, present, init):
@@ -99,14 +99,29 @@ def test_memory_grows_with_the_batch_that_is_asked_for():
     assert all_at_once < 32 * 1e5
 
 
+def test_pieces_of_a_list_report_progress_and_keep_the_answers(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    graphs = _graphs([(7, 15), (10, 30), (8, 15), (7, 14)])
+    whole = jr.average(graphs, PLAIN)
+    monkeypatch.setattr(many, "_PIECE", 2)
+    calls = []
+    found = jr.average(graphs, PLAIN, progress=lambda *call: calls.append(call))
+    assert calls == [("averaging graphs", done, 4) for done in (0, 2, 3, 4)]
+    for one, other in zip(found, whole, strict=True):
+        np.testing.assert_allclose(one.T_world_i, other.T_world_i, atol=1e-5)
+
+
 def test_lists_stand_inside_jit():
-    graphs = _graphs(SIZES[:2])
+    graphs, calls = _graphs(SIZES[:2]), []
 
     @jax.jit
     def poses(graphs):
-        return [sol.T_world_i for sol in jr.average(graphs, PLAIN)]
+        found = jr.average(graphs, PLAIN, progress=lambda *call: calls.append(call))
+        return [sol.T_world_i for sol in found]
 
     found = poses(graphs)
+    assert not calls
     for T, sol in zip(found, jr.average(graphs, PLAIN), strict=True):
         np.testing.assert_allclose(T, sol.T_world_i, atol=1e-5)
 
