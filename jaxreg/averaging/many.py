@@ -22,7 +22,7 @@ from jaxreg.graph.pose_graph import PoseGraph
 # The least sizes that graphs are padded to.
 _LEAST_POSES, _LEAST_EDGES = 8, 16
 _STAGE = "averaging graphs"
-# Graphs in one call of a compiled program.
+# Graphs in one call of a compiled program, at most, unless more are side by side.
 _PIECE = 64
 
 
@@ -87,7 +87,7 @@ def _pieces(
     for num_poses in np.unique(sizes):
         rows = np.flatnonzero(sizes == num_poses)
         num_edges = rounded_up(max(graphs[k].num_edges for k in rows), _LEAST_EDGES)
-        piece = min(max(_PIECE, batch_size), len(rows))
+        piece = -(-len(rows) // -(-len(rows) // max(_PIECE, batch_size)))
         for start in range(0, len(rows), piece):
             first = min(start, len(rows) - piece)
             yield rows[first : first + piece], (int(num_poses), num_edges)
