@@ -1,9 +1,7 @@
 """`python -m jaxreg` is the command `jaxreg`."""
 
-import sys
-
-from jaxreg.cli.main import main
+from jaxreg.cli.main import command
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command()

@@ -3,18 +3,42 @@
 Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted.
 """
 
+import _thread
 import io
 import os
 import shlex
 import sys
+import threading
 from collections.abc import Sequence
 from importlib.util import find_spec
+from typing import NoReturn
 
 from jaxreg.io.errors import InputError, MissingExtraError
 from jaxreg.io.result import version
 
 
 _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
+_INTERRUPTED = 130
+
+
+def command() -> NoReturn:
+    """The process `jaxreg`: runs the command of its arguments and ends."""
+    sys.unraisablehook = _heard_again
+    code = main()
+    if code == _INTERRUPTED:
+        # Threads may still compute, and crash as Python takes down what they use.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+def _heard_again(lost: "sys.UnraisableHookArgs") -> None:
+    """Interrupts again if Python dropped it, as in callbacks of garbage collection."""
+    if isinstance(lost.exc_value, KeyboardInterrupt):
+        threading.Timer(0.1, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as err:
         kept = str(err) or "no results were written"
         sys.stderr.write(f"jaxreg: interrupted; {kept}.\n")
-        return 130
+        return _INTERRUPTED
 
 
 def _run(arguments: list[str]) -> int:

@@ -98,6 +98,8 @@ class Multiview(SearchOptions):
                 f"{log.path}: pairs of an interrupted run, replaced by those of this "
                 "one; --resume would go on with them."
             )
+        if self.resume and not len(log):
+            session.console.print(f"{log.path}: no pairs to go on with, all are new.")
         return log
 
 

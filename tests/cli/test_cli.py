@@ -448,6 +448,28 @@ def test_interruption_is_said_in_one_line(
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+def test_an_interruption_that_python_dropped_is_heard_again():
+    code = """
+import gc, sys, time
+from jaxreg.cli import main
+
+def drop(*_):
+    gc.callbacks.clear()
+    raise KeyboardInterrupt
+
+def run(_):
+    gc.callbacks.append(drop)
+    gc.collect()
+    time.sleep(30)
+
+main._run, sys.argv = run, ["jaxreg", "info"]
+main.command()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr == "jaxreg: interrupted; no results were written.\n"
+
+
 def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
