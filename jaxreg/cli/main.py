@@ -1,6 +1,7 @@
 """Entry point of the command `jaxreg`: parses, dispatches, and speaks of errors.
 
-Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted.
+Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted, 141
+when nobody reads the output any more.
 """
 
 import _thread
@@ -18,7 +19,7 @@ from jaxreg.io.result import version
 
 
 _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
-_INTERRUPTED = 130
+_INTERRUPTED, _UNREAD = 130, 141
 
 
 def command() -> NoReturn:
@@ -55,6 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments in (["--version"], ["-V"]):
         sys.stdout.write(f"jaxreg {version('jaxreg')}\n")
         return 0
+    if sys.stdout is None:  # closed by the caller
+        sys.stdout = open(os.devnull, "w")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names need not be UTF-8
     try:
@@ -62,6 +65,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (InputError, MissingExtraError) as err:
         sys.stderr.write(f"jaxreg: {err}\n")
         return 2
+    except BrokenPipeError:  # as in `jaxreg ... | head`: nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _UNREAD
     except OSError as err:
         where = f"{err.filename}: " if err.filename else ""
         sys.stderr.write(

@@ -1,7 +1,6 @@
 """What a file of points or poses holds: counts, extent, spacing, a word on units."""
 
 import collections
-import gzip
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxreg.io import g2o
-from jaxreg.io.errors import InputError, MissingExtraError
+from jaxreg.io.errors import MissingExtraError
 from jaxreg.io.points import NamedPoints, read_named
+from jaxreg.io.rows import text_lines
 from jaxreg.io.toro import read_toro
 
 
@@ -209,10 +209,6 @@ def _graph(path: Path) -> GraphFacts:
 
 
 def _unknown_lines(path: Path, kinds: Sequence[str]) -> dict[str, int]:
-    try:
-        with gzip.open(path, "rt") if path.suffix == ".gz" else open(path) as stream:
-            words = (line.split(maxsplit=1)[:1] for line in stream)
-            tags = collections.Counter(w[0] for w in words if w and w[0][0] != "#")
-    except OSError as err:
-        raise InputError(f"{path}: cannot be read ({err.strerror}).") from err
+    words = (line.split(maxsplit=1)[:1] for line in text_lines(path))
+    tags = collections.Counter(w[0] for w in words if w and w[0][0] != "#")
     return {tag: num for tag, num in tags.items() if tag not in kinds}

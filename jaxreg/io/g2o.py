@@ -20,6 +20,7 @@ from jaxreg.graph.pose_graph import EdgeError, PoseGraph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
+from jaxreg.io.rows import text_lines
 
 
 _VERTEX = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
@@ -173,33 +174,24 @@ def _lines(tag: str, ids: np.ndarray, values: np.ndarray, digits: int) -> list[s
 
 
 def _parse(path: Path) -> _File:
-    try:
-        opened = gzip.open(path, "rt") if path.suffix == ".gz" else open(path)
-        with opened as stream:
-            lines = stream.read().splitlines()
-    except UnicodeDecodeError as err:
-        raise InputError(
-            f"{path}: not a text file, as g2o files are.\n"
-            "Give a pose graph; scans go to: jaxreg multiview"
-        ) from err
-    except (OSError, EOFError) as err:
-        reason = getattr(err, "strerror", None) or err
-        raise InputError(f"{path}: cannot be read ({reason}).") from err
     found: dict[str, list[tuple[int, list[str]]]] = collections.defaultdict(list)
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text_lines(path), start=1):
         words = line.split()
         if words and not words[0].startswith("#"):
             found[words[0]].append((number, words[1:]))
+    dims = [d for d in (2, 3) if any(f"SE{d}" in tag for tag in found)]
+    if len(dims) != 1:
+        what = "2D and 3D lines in one file" if dims else "no SE2 or SE3 line"
+        raise InputError(
+            f"{path}: {what}; this is no pose graph.\n"
+            "Give a g2o file of one dimension; scans go to: jaxreg multiview"
+        )
     unknown = {tag: len(rows) for tag, rows in found.items() if tag not in KINDS}
     if unknown:
         counts = ", ".join(f"{n} x {tag}" for tag, n in unknown.items())
         warnings.warn(
             f"{path}: skipped lines of unknown kinds ({counts}).", stacklevel=3
         )
-    dims = [d for d in (2, 3) if any(f"SE{d}" in tag for tag in found)]
-    if len(dims) != 1:
-        what = "2D and 3D lines in one file" if dims else "no SE2 or SE3 line"
-        raise InputError(f"{path}: {what}; this is no pose graph.")
     d = dims[0]
     vertex, edge = list(_VERTEX)[d - 2], list(_EDGE)[d - 2]
     vertices = _rows(path, vertex, found[vertex], 1, _VERTEX[vertex])

@@ -42,7 +42,10 @@ def read_toro(path: str | Path) -> PoseGraph:
     dims = {d for _, d in edges}
     if len(dims) != 1:
         what = "EDGE2 and EDGE3 in one file" if dims else "no EDGE2 or EDGE3 line"
-        raise InputError(f"{path}: {what}; this is no pose graph.")
+        raise InputError(
+            f"{path}: {what}; this is no pose graph.\n"
+            "Give a TORO file of one dimension; scans go to: jaxreg multiview"
+        )
     d = dims.pop()
     k = lie.tangent_dim(d)
     width = 2 + k + k * (k + 1) // 2

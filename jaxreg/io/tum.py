@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
+from jaxreg.io.rows import text_lines
 
 
 def write_tum(
@@ -57,12 +58,7 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, Float[Array, "v 4 4"]]:
             the message names.
     """
     rows = []
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as err:
-        reason = getattr(err, "strerror", None) or err
-        raise InputError(f"{path}: cannot be read ({reason}).") from err
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text_lines(path), start=1):
         words = line.split("#")[0].replace(",", " ").split()
         if not words:
             continue

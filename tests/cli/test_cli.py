@@ -470,6 +470,15 @@ main.command()
     assert done.stderr == "jaxreg: interrupted; no results were written.\n"
 
 
+def test_a_reader_who_leaves_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as pipe:
+        command = [sys.executable, "-m", "jaxreg", "--help"]
+        done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
 def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
