@@ -160,7 +160,7 @@ def _files_of_earlier(folder: Path) -> set[str]:
 
 def write_json(path: str | Path, document: dict[str, Any]) -> None:
     """Writes a document as JSON; numbers that are not finite become null."""
-    text = json.dumps(_finite(document), indent=1, allow_nan=False)
+    text = json.dumps(without_nan(document), indent=1, allow_nan=False)
     # Rows of matrices on one line, so that a person can read them.
     text = _ROW.sub(lambda row: " ".join(row[0].split()), text)
     with atomic_write(path) as file:
@@ -309,11 +309,12 @@ def _thin(points: np.ndarray, max_points: int) -> np.ndarray:
         size *= 1.25
 
 
-def _finite(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
+    """Dicts and lists for JSON: numbers that are not finite become null."""
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
+        return {str(k): without_nan(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
+        return [without_nan(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

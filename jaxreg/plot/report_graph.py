@@ -65,11 +65,8 @@ def write_graph_report(
     origin = np.median(T[placed][:, :-1, -1], axis=0)
     old = np.asarray(before.T_world_i, np.float64)
     angle, distance = residuals(T, edges, np.asarray(graph.T_i_j)[keep])
-    width = np.asarray(solution.kernel_width, np.float64)
-    shown = min(len(T), _MAX_ROWS)
     if covariances is None and len(T) <= MAX_COVARIANCES:
         covariances = jaxreg.pose_covariances(graph, solution)
-    sigma = deviations(covariances, len(T))
     title = f"{len(T):,} poses from {len(edges):,} edges"
     data = {
         "kind": "graph",
@@ -88,22 +85,26 @@ def write_graph_report(
         "angle": floats(angle),
         "distance": floats(distance),
         "names": labels,
-        "scans": [
-            {
-                "name": labels[i],
-                "placed": bool(placed[i]),
-                "T": T[i].tolist(),
-                "sigma": sigma[i].tolist(),
-            }
-            for i in range(shown)
-        ],
-        "kernel_width": width.tolist(),
+        "scans": _rows(labels, placed, T, deviations(covariances, len(T))),
+        "kernel_width": np.asarray(solution.kernel_width, np.float64).tolist(),
         "steps": int(solution.num_steps),
         "residual": float(solution.residual),
         "curves": trace_curves(solution.trace, int(solution.num_steps)),
         "details": details_entry(details),
     }
     write_page(path, title, data)
+
+
+def _rows(
+    names: list[str], placed: np.ndarray, T_world_i: np.ndarray, sigma: np.ndarray
+) -> list[dict[str, Any]]:
+    """Of the table of poses, which does not show thousands."""
+    return [
+        {"name": name, "placed": bool(ok), "T": T.tolist(), "sigma": s.tolist()}
+        for name, ok, T, s in zip(
+            names[:_MAX_ROWS], placed, T_world_i, sigma, strict=False
+        )
+    ]
 
 
 def _camera_on_path(T_world_i: np.ndarray) -> list[list[float]] | None:

@@ -2,13 +2,13 @@
 
 import html
 import json
-import math
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import MissingExtraError
+from jaxreg.io.result import without_nan
 
 
 _SCRIPTS = (
@@ -65,15 +65,5 @@ def _in_script(code: str) -> str:
 
 def _in_json(data: dict[str, Any]) -> str:
     """JSON that no text in it can end: a file may be named `</script>`."""
-    text = json.dumps(_finite(data), allow_nan=False, separators=(",", ":"))
+    text = json.dumps(without_nan(data), allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
