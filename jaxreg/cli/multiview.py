@@ -1,5 +1,6 @@
 """`jaxreg multiview`: many scans into one frame."""
 
+import dataclasses
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from jaxreg.io.errors import InputError
 from jaxreg.io.pair_log import PairLog, Pairs
 from jaxreg.io.result import Result, version
 from jaxreg.io.stanford import read_conf
+from jaxreg.plot.results import result_of
 
 
 Order = Literal["any", "sequential"]
@@ -129,27 +131,14 @@ def reconstruct_scans(
         progress=progress,
         on_pairs=None if log is None else lambda m: log.add(_pairs(m)),
     )
-    component, keep = np.asarray(sol.component), np.asarray(sol.graph.mask)
+    result = result_of(sol, scans.points, scans.names)
     # The frame of a component's first scan; that of a scan alone means nothing.
-    first = np.argmax(component[:, None] == component, axis=1)
-    edges = np.asarray(sol.graph.edges)[keep]
-    i, j = edges.T
-    return Result(
-        names=scans.names,
-        T_world_i=outputs.uncentre(np.asarray(sol.T_world_i), middles[first], middles),
-        component=component,
-        status=Status(int(sol.status)),
-        scan_status=np.asarray(sol.scan_status),
-        num_points=np.array([len(x) for x in scans.points]),
-        num_dropped=np.asarray(sol.num_dropped),
-        edges=edges,
-        T_i_j=outputs.uncentre(
-            np.asarray(sol.graph.T_i_j)[keep], middles[i], middles[j]
-        ),
-        overlap=np.asarray(sol.overlap)[keep],
-        weight=np.asarray(sol.edge_weight)[keep],
-        inlier_rmse=np.asarray(sol.inlier_rmse)[keep],
-        trace=sol.trace,
+    first = np.argmax(result.component[:, None] == result.component, axis=1)
+    i, j = result.edges.T
+    return dataclasses.replace(
+        result,
+        T_world_i=outputs.uncentre(result.T_world_i, middles[first], middles),
+        T_i_j=outputs.uncentre(result.T_i_j, middles[i], middles[j]),
     )
 
 

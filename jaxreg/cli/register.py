@@ -1,5 +1,6 @@
 """`jaxreg register`: one scan onto another."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -16,6 +17,7 @@ from jaxreg.cli.runtime import SearchOptions, Session
 from jaxreg.io.atomic import require_writable
 from jaxreg.io.errors import InputError
 from jaxreg.io.result import Result
+from jaxreg.plot.results import result_of
 
 
 @dataclass(frozen=True)
@@ -63,26 +65,13 @@ def _register(
     centred, middles = scans.centred()
     target, source = (x[np.isfinite(x).all(axis=1)] for x in centred)
     sol = jaxreg.register(source, target, method, key=key)
-    status = Status(int(sol.status))
-    found = status in (Status.CONVERGED, Status.MAX_STEPS, Status.AMBIGUOUS)
     T_target_source = outputs.uncentre(
         np.asarray(sol.T_target_source)[None], middles[0], middles[1]
     )
-    rows = np.array([len(x) for x in scans.points])
-    result = Result(
-        names=scans.names,
+    result = dataclasses.replace(
+        result_of(sol, scans.points, scans.names),
         T_world_i=np.stack([np.eye(len(T_target_source[0])), T_target_source[0]]),
-        component=np.where([True, found], 0, -1),
-        status=status,
-        scan_status=np.array([Status.CONVERGED, status]),
-        num_points=rows,
-        num_dropped=rows - [len(target), len(source)],
-        edges=np.array([[0, 1]]),
         T_i_j=T_target_source,
-        overlap=np.array([float(sol.overlap)]),
-        weight=np.array([float(found)]),
-        inlier_rmse=np.array([float(sol.inlier_rmse)]),
-        trace=sol.trace,
     )
     moved = outputs.uncentre(
         np.asarray(sol.modes.T_target_source), middles[0], middles[1]

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -19,6 +18,7 @@ import jaxreg
 from jaxreg import Status
 from jaxreg.cli.main import main
 from jaxreg.io import MissingExtraError, read_points, read_tum, write_ply
+from jaxreg.local import Modes
 
 
 RNG = np.random.default_rng(0)
@@ -69,19 +69,23 @@ def _fake_reconstruct(
         i, j = edges.T
         graph = jaxreg.PoseGraph.from_edges(edges, np.linalg.inv(T)[i] @ T[j])
         both = np.array(placed)[edges].all(axis=1)
-        lost = Status.LOW_OVERLAP
-        return SimpleNamespace(
+        lost, overlap = Status.LOW_OVERLAP, jnp.asarray(np.where(both, 0.8, 0.1))
+        zeros = jnp.zeros(len(edges))
+        dropped = [np.sum(~np.isfinite(s).all(1)) for s in scans]
+        modes = (x[:, None] for x in (graph.T_i_j, overlap, zeros))
+        return jaxreg.ReconstructionSolution(
             T_world_i=jnp.asarray(T),
-            status=jnp.asarray(0 if all(placed) else Status.DISCONNECTED),
+            status=jnp.asarray(0 if all(placed) else Status.DISCONNECTED, int),
             scan_status=jnp.asarray([0 if p else lost for p in placed]),
             placed=jnp.asarray(placed),
             component=jnp.asarray(component or np.where(placed, 0, -1)),
             graph=graph,
-            overlap=jnp.asarray(np.where(both, 0.8, 0.1)),
+            overlap=overlap,
             edge_weight=jnp.asarray(both.astype(float)),
-            inlier_rmse=jnp.zeros(len(edges)),
-            num_dropped=jnp.asarray([np.sum(~np.isfinite(s).all(1)) for s in scans]),
-            trace=None,
+            inlier_rmse=zeros,
+            mode=jnp.zeros(len(edges), int),
+            motions=jaxreg.RelativeMotions(graph.edges, *modes),
+            num_dropped=jnp.asarray(dropped),
         )
 
     monkeypatch.setattr(jaxreg, "reconstruct", reconstruct)
@@ -289,12 +293,30 @@ def test_dropped_rows_are_counted(
     assert len(read_points("jaxreg-out/merged.ply")) == 120
 
 
-def _modes(T: np.ndarray) -> SimpleNamespace:
-    """One pose that the search ended in, and an unused row."""
-    return SimpleNamespace(
-        T_target_source=jnp.stack([T, T]),
-        weight=jnp.asarray([1.0, 0.0]),
-        fitness=jnp.asarray([0.95, 0.0]),
+def _registered(T: np.ndarray, status: int, overlap: float) -> Any:
+    """A solution with the pose that the search ended in, and an unused mode."""
+    number, modes = jnp.zeros((), int), jnp.asarray([1.0, 0.0])
+    covariance = 1e-6 * jnp.eye(6)
+    return jaxreg.RegistrationSolution(
+        T_target_source=jnp.asarray(T),
+        status=jnp.asarray(status, int),
+        fitness=jnp.asarray(0.95),
+        inlier_rmse=jnp.asarray(0.02),
+        num_inliers=number,
+        overlap=jnp.asarray(overlap),
+        num_steps=number,
+        H=jnp.eye(6),
+        b=jnp.zeros(6),
+        error=jnp.zeros(()),
+        covariance=covariance,
+        modes=Modes(
+            T_target_source=jnp.stack([T, T]),
+            weight=modes,
+            fitness=0.95 * modes,
+            overlap=overlap * modes,
+            inlier_rmse=0.02 * modes,
+            covariance=jnp.stack([covariance] * 2),
+        ),
     )
 
 
@@ -303,16 +325,7 @@ def _register_s1_onto_s0(
 ) -> Any:
     assert np.isfinite(source).all()
     T = _shift(-np.median(CLOUD, axis=0)) @ POSES[1] @ _shift(_middle_of(POSES[1]))
-    return SimpleNamespace(
-        T_target_source=jnp.asarray(T),
-        status=jnp.asarray(0),
-        fitness=jnp.asarray(0.95),
-        overlap=jnp.asarray(0.93),
-        inlier_rmse=jnp.asarray(0.02),
-        covariance=1e-6 * jnp.eye(6),
-        modes=_modes(T),
-        trace=None,
-    )
+    return _registered(T, 0, 0.93)
 
 
 def test_register_writes_the_motion_between_the_files(
@@ -339,16 +352,7 @@ def test_register_without_overlap_exits_with_2(
     _save_scans(folder)
 
     def register(source: np.ndarray, target: np.ndarray, method: Any, **_: Any) -> Any:
-        return SimpleNamespace(
-            T_target_source=jnp.full((4, 4), jnp.nan),
-            status=jnp.asarray(status),
-            fitness=jnp.asarray(0.0),
-            overlap=jnp.asarray(0.0),
-            inlier_rmse=jnp.asarray(jnp.nan),
-            covariance=jnp.full((6, 6), jnp.nan),
-            modes=_modes(np.full((4, 4), np.nan)),
-            trace=None,
-        )
+        return _registered(np.full((4, 4), np.nan), status, 0.0)
 
     monkeypatch.setattr(jaxreg, "register", register)
     before = _left(folder)
