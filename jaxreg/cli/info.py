@@ -19,7 +19,8 @@ class Info:
     """Tell what files of scans or pose graphs hold."""
 
     files: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE ...")
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="FILE ...", help_behavior_hint="(required)"),
     ]
     """Scans, archives of scans, folders of these, pose graphs (g2o, TORO .graph)."""
     json: bool = False

@@ -32,7 +32,8 @@ class Multiview(SearchOptions):
     """Bring scans into one frame, without an initial guess."""
 
     scans: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN ...")
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="SCAN ...", help_behavior_hint="(required)"),
     ]
     """Files (PLY, XYZ, PCD, LAS, ...), a folder of these, or an archive (NPZ, E57)."""
     truth: Annotated[

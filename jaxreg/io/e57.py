@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxreg.io.arrays import as_points
-from jaxreg.io.extras import reader, unreadable
+from jaxreg.io.extras import require, unreadable
 from jaxreg.io.thinning import Step, every_row
 
 
@@ -33,7 +33,7 @@ def read_e57(
         InputError: if it is no whole E57 file, or a scan of it holds no points.
         MissingExtraError: if pye57 is not installed.
     """
-    pye57 = reader("pye57", "E57")
+    pye57 = require("pye57", "Reading E57")
     scans = {}
     try:
         with pye57.E57(str(path)) as file:

@@ -1,4 +1,4 @@
-"""Packages that only some formats need, imported when such a file is met."""
+"""Packages that only some formats need, imported when they are needed."""
 
 import importlib
 from pathlib import Path
@@ -7,8 +7,8 @@ from types import ModuleType
 from jaxreg.io.errors import InputError, MissingExtraError
 
 
-def reader(package: str, kind: str, extra: str = "formats") -> ModuleType:
-    """The package of an extra that reads files or makes objects of this kind.
+def require(package: str, purpose: str, extra: str = "formats") -> ModuleType:
+    """The package of an extra that is needed for a purpose, for the message.
 
     Raises:
         MissingExtraError: if it is not installed.
@@ -16,7 +16,7 @@ def reader(package: str, kind: str, extra: str = "formats") -> ModuleType:
     try:
         return importlib.import_module(package)
     except ModuleNotFoundError as err:
-        raise MissingExtraError(package, f"Reading {kind}", extra) from err
+        raise MissingExtraError(package, purpose, extra) from err
 
 
 def unreadable(path: str | Path, kind: str, reason: object) -> InputError:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.io.extras import reader
+from jaxreg.io.extras import require
 
 
 def points_of(geometry: Any) -> np.ndarray:
@@ -49,7 +49,7 @@ def to_open3d(points: Any, colors: Any = None) -> Any:
     Raises:
         MissingExtraError: if open3d is not installed.
     """
-    open3d = reader("open3d", "Open3D's clouds", "bench")
+    open3d = require("open3d", "Making Open3D's clouds", "bench")
     cloud = open3d.geometry.PointCloud()
     cloud.points = open3d.utility.Vector3dVector(np.asarray(points, np.float64))
     if colors is not None:
@@ -67,7 +67,7 @@ def to_trimesh(points: Any, colors: Any = None) -> Any:
     Raises:
         MissingExtraError: if trimesh is not installed.
     """
-    trimesh = reader("trimesh", "trimesh's clouds")
+    trimesh = require("trimesh", "Making trimesh's clouds")
     return trimesh.PointCloud(np.asarray(points, np.float64), colors=colors)
 
 
@@ -84,7 +84,7 @@ def to_open3d_graph(graph: PoseGraph, T_world_i: Any) -> Any:
     Raises:
         MissingExtraError: if open3d is not installed.
     """
-    o3d = reader("open3d", "Open3D's graphs", "bench").pipelines.registration
+    o3d = require("open3d", "Making Open3D's graphs", "bench").pipelines.registration
     out = o3d.PoseGraph()
     for T in np.asarray(T_world_i, np.float64):
         out.nodes.append(o3d.PoseGraphNode(T))
@@ -125,7 +125,7 @@ def to_gtsam(T_world_i: Any) -> Any:
     Raises:
         MissingExtraError: if gtsam is not installed.
     """
-    gtsam = reader("gtsam", "GTSAM's values", "bench")
+    gtsam = require("gtsam", "Making GTSAM's values", "bench")
     values = gtsam.Values()
     for key, T in enumerate(np.asarray(T_world_i, np.float64)):
         if len(T) == 4:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxreg.io.arrays import as_points
-from jaxreg.io.extras import reader, unreadable
+from jaxreg.io.extras import require, unreadable
 from jaxreg.io.thinning import Step, every_row
 
 
@@ -32,8 +32,8 @@ def parse_las(
         InputError: if the data are no whole LAS or LAZ file or hold no points.
         MissingExtraError: if laspy or lazrs is not installed.
     """
-    laspy = reader("laspy", "LAS and LAZ")
-    reader("lazrs", "LAZ")
+    laspy = require("laspy", "Reading LAS and LAZ")
+    require("lazrs", "Reading LAZ")
     try:
         with laspy.open(path if data is None else io.BytesIO(data)) as file:
             fields = tuple(file.header.point_format.dimension_names)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxreg.io.arrays import as_points
-from jaxreg.io.extras import reader, unreadable
+from jaxreg.io.extras import require, unreadable
 from jaxreg.io.thinning import Step, every_row, number_rows, records
 
 
@@ -52,7 +52,7 @@ def parse_stl(data: bytes | None, path: Path, step: Step = every_row) -> _Scan:
 def _vertices(
     data: bytes | None, path: Path, kind: str, word: bytes, step: Step
 ) -> _Scan:
-    trimesh = reader("trimesh", "OBJ and STL")
+    trimesh = require("trimesh", "Reading OBJ and STL")
     try:
         if data is None and step is not every_row and path.stat().st_size > _LARGE:
             points, every = _some_vertices(path, word, step)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxreg.io.arrays import as_points
-from jaxreg.io.extras import reader, unreadable
+from jaxreg.io.extras import require, unreadable
 from jaxreg.io.thinning import Step, every_row, number_rows, records
 
 
@@ -35,7 +35,7 @@ def parse_pcd(
         InputError: if the data are no whole PCD file or hold no points.
         MissingExtraError: if pypcd4 is not installed.
     """
-    pypcd4 = reader("pypcd4", "PCD")
+    pypcd4 = require("pypcd4", "Reading PCD")
     try:
         with path.open("rb") if data is None else io.BytesIO(data) as file:
             header = pypcd4.MetaData.parse_header(_header(file))
