@@ -6,6 +6,8 @@ import numpy as np
 
 from jaxreg.io.errors import InputError
 from jaxreg.io.points import stem
+from jaxreg.io.quaternions import motions_from_xyzw
+from jaxreg.io.rows import text_lines
 
 
 def read_conf(path: str | Path) -> dict[str, np.ndarray]:
@@ -25,15 +27,8 @@ def read_conf(path: str | Path) -> dict[str, np.ndarray]:
     Raises:
         InputError: if the file is missing, unreadable, or holds no pose.
     """
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as err:
-        reason = getattr(err, "strerror", None) or "not a text file"
-        raise InputError(
-            f"{path}: cannot be read ({reason}).\nCheck the name of the pose file."
-        ) from err
     poses: dict[str, np.ndarray] = {}
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text_lines(path), start=1):
         words = line.split()
         if words and words[0] == "bmesh":
             poses[stem(words[1])] = _pose(words[2:], f"{path}, line {number}")
@@ -47,20 +42,14 @@ def read_conf(path: str | Path) -> dict[str, np.ndarray]:
 
 def _pose(words: list[str], where: str) -> np.ndarray:
     try:
-        t_x, t_y, t_z, *xyzw = (float(w) for w in words)
-        x, y, z, w = np.array(xyzw) / max(np.linalg.norm(xyzw), 1e-12)
-    except ValueError as err:
+        numbers = np.array(words, dtype=np.float64)
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) != 7 or not np.isfinite(numbers).all() or not numbers[3:].any():
         raise InputError(
-            f"{where}: wanted seven numbers after the file name.\nCorrect the line."
-        ) from err
-    T = np.eye(4)
-    T[:3, 3] = t_x, t_y, t_z
-    # The transpose of the Hamilton matrix is the rotation of the conjugate.
-    T[:3, :3] = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).T
-    return T
+            f"{where}: wanted seven numbers after the file name, a position and a "
+            "quaternion.\nCorrect the line."
+        )
+    # The rotation is that of the conjugate.
+    t, xyzw = numbers[None, :3], numbers[None, 3:] * [-1, -1, -1, 1]
+    return motions_from_xyzw(t, xyzw)[0]
