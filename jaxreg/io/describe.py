@@ -8,9 +8,9 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from jaxreg.io import g2o
-from jaxreg.io.errors import MissingExtraError
 from jaxreg.io.points import NamedPoints, read_named
 from jaxreg.io.rows import text_lines
 from jaxreg.io.toro import read_toro
@@ -147,10 +147,6 @@ def _spacing(points: np.ndarray, parts: int = 5, size: int = 40_000) -> float | 
 
     The queries lie in the middle of a slice, so that their neighbours lie in it too.
     """
-    try:
-        from scipy.spatial import KDTree
-    except ModuleNotFoundError as err:
-        raise MissingExtraError("scipy", "The spacing of points") from err
     if len(points) < 2:
         return None
     order = np.argsort(points[:, np.argmax(np.ptp(points, axis=0))])
