@@ -165,6 +165,23 @@ def test_averaging_has_finite_gradients_where_formulas_are_singular(name):
     assert np.abs(by_T).max() > 1e-3
 
 
+def test_arguments_of_no_influence_have_no_slope():
+    """Plain averaging knows no weights, and least squares no kernel width."""
+    T, weight = measured(3, float)
+    source, target, guess = _clouds(2)
+
+    def averaged(weight):
+        sol = jr.average(graph(T, weight), jr.MotionAveraging())
+        return jnp.sum(sol.T_world_i[1])
+
+    def registered(width):
+        method = jr.ICP(POINTS, L2(), width_end=width)
+        return _answer(_solve(method, source, target, guess))
+
+    assert np.all(jax.jit(jax.grad(averaged))(weight) == 0)
+    assert jax.jit(jax.grad(registered))(1.0) == 0
+
+
 def test_graphs_too_large_for_a_dense_matrix_have_exact_gradients():
     """134 poses in the plane: 402 unknowns, so by GMRES."""
     num, rng = 134, np.random.default_rng(0)

@@ -29,7 +29,6 @@ from jaxreg.averaging.gauss_newton import gauss_newton_gradients, gauss_newton_s
 from jaxreg.averaging.graduated import graduated
 from jaxreg.averaging.iterate import (
     Iterated,
-    WidthOf,
     averaging_gradients,
     averaging_step,
     iterate,
@@ -130,32 +129,18 @@ class Correntropy(AbstractAverager):
     def _paper(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"], _: bool
     ) -> Iterated:
-        scale = length_scale(graph)
-        root_two = jnp.sqrt(jnp.asarray(2, scale.dtype))
-
-        def adaptive(alpha: Array | float) -> WidthOf:
-            def width_of(g: PoseGraph, T: Array, _: Array) -> Array:
-                e = weighted_mean(frobenius(g, T, scale), g.weight)
-                sigma = alpha * jnp.maximum(e, 64 * jnp.finfo(e.dtype).eps)
-                # The Frobenius norm of a small rotation is sqrt(2) times its angle.
-                return jnp.stack([sigma * scale, sigma / root_two])
-
-            return width_of
-
-        def followed(g: PoseGraph, T: Array, width: Array) -> Array:
-            return gaussian_trust(g, T, adaptive(self.alpha)(g, T, width))
-
-        rows = scaled_rows(self.rows)
+        scale, rows = length_scale(graph), scaled_rows(self.rows)
         end = iterate(
             graph,
             T_start,
             jnp.full((2,), jnp.inf, scale.dtype),
-            adaptive(jax.lax.stop_gradient(self.alpha)),
+            eqx.Partial(_paper_width, jax.lax.stop_gradient(self.alpha), scale),
             gaussian_trust,
             averaging_step(rows),
             max_steps=self.max_steps,
             tolerance=self.tolerance,
         )
+        followed = eqx.Partial(_paper_trust, self.alpha, scale)
         return averaging_gradients(graph, end, followed, rows)
 
     def _annealed(
@@ -164,10 +149,7 @@ class Correntropy(AbstractAverager):
         """Ends from a wide kernel or, where more coherent, from a narrow one."""
         fixed, T_start = jax.lax.stop_gradient((graph, T_start))
         scale = length_scale(fixed)
-
-        def followed(g: PoseGraph, T: Array, width: Array) -> Array:
-            return followed_width((g, T, width, scale))
-
+        followed = eqx.Partial(followed_width, scale)
         T_wide = _better_start(fixed, T_start, scaled_rows(self.rows), fixed)
         width = first_width(fixed, T_wide)
         if not compare:
@@ -243,6 +225,22 @@ def _solution(graph: PoseGraph, end: Iterated) -> AveragingSolution:
         num_steps=end.num_steps,
         trace=end.trace,
     )
+
+
+def _paper_width(
+    alpha: Array | float, scale: Array, g: PoseGraph, T: Array, _: Array
+) -> Float[Array, "2"]:
+    """Sigma = alpha times the mean residual (Eq. 22)."""
+    e = weighted_mean(frobenius(g, T, scale), g.weight)
+    sigma = alpha * jnp.maximum(e, 64 * jnp.finfo(e.dtype).eps)
+    # The Frobenius norm of a small rotation is sqrt(2) times its angle.
+    return jnp.stack([sigma * scale, sigma / jnp.sqrt(jnp.asarray(2, e.dtype))])
+
+
+def _paper_trust(
+    alpha: Array | float, scale: Array, g: PoseGraph, T: Array, width: Array
+) -> Float[Array, " e"]:
+    return gaussian_trust(g, T, _paper_width(alpha, scale, g, T, width))
 
 
 def _better_start(

@@ -4,6 +4,7 @@ Motion averaging solves for rotations and translations side by side, which is fa
 nearly right; here each part counts at its own precision.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -110,25 +111,33 @@ def gauss_newton_step(
     return product(T_world_i, lie.exp(tangent))
 
 
+def held_width(graph: PoseGraph, T: Array, width: Array) -> Array:
+    """The width as it is, without derivatives."""
+    return width
+
+
 def gauss_newton_gradients(
     graph: PoseGraph,
     end: Iterated,
     trust_of: TrustOf,
-    width_of: WidthOf = lambda g, T, width: width,
+    width_of: WidthOf = held_width,
 ) -> Iterated:
     """The same result with derivatives by the balance of forces at the minimum.
 
-    `width_of` gives the width of the end the derivatives that it is to have.
+    `width_of` gives the width of the end the derivatives that it is to have. Both
+    functions are pytrees of the values that they use.
     """
     held = jax.lax.stop_gradient(graph.weight * end.trust)
     top = jnp.max(held)
     held = held / jnp.where(top > 0, top, 1)
-
-    def imbalance(g: PoseGraph, T: Array) -> Array:
-        width = width_of(g, T, end.width)
-        W = precisions(g, trust_of(g, T, width), width)
-        return forces(g, T, W)
-
+    imbalance = eqx.Partial(_net_force, trust_of, width_of, end.width)
     T = differentiable(graph, end.T_world_i, imbalance, held)
     width = width_of(graph, T, end.width)
     return end._replace(T_world_i=T, trust=trust_of(graph, T, width), width=width)
+
+
+def _net_force(
+    trust_of: TrustOf, width_of: WidthOf, width: Array, g: PoseGraph, T: Array
+) -> Array:
+    width = width_of(g, T, width)
+    return forces(g, T, precisions(g, trust_of(g, T, width), width))

@@ -8,6 +8,7 @@ little until the last width, where their error alone decides.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -88,13 +89,9 @@ def graduated(
     believed = (fixed.weight > 0) & (near.weight == fixed.weight)
     doubt = near.weight / jnp.where(fixed.weight > 0, fixed.weight, 1)
 
-    def trust_of(g: PoseGraph, T: Array, state: _State) -> Array:
-        now = _problem(g, state.parts, state.width)
-        return now.trust(now.squares(T))
-
     def attempt(b: _Best) -> _Best:
         end = _narrowed(fixed, doubt, starts[b.tried], max_steps)
-        trust = trust_of(fixed, end.found.T, end)
+        trust = _trust_at(end, fixed, end.found.T)
         score = redundancy(fixed, end.found.T)
         steps = b.end.found.step + end.found.step
         better = score > b.score
@@ -119,13 +116,19 @@ def graduated(
     ).end
     result = Iterated(
         end.found.T,
-        trust_of(fixed, end.found.T, end),
+        _trust_at(end, fixed, end.found.T),
         _DEVIATIONS * end.parts,
         end.found.converged,
         end.found.step,
         AveragingTrace.of(end.rows, end.round),
     )
-    return gauss_newton_gradients(graph, result, lambda g, T, _: trust_of(g, T, end))
+    return gauss_newton_gradients(graph, result, eqx.Partial(_trust_at, end))
+
+
+def _trust_at(state: _State, graph: PoseGraph, T: Array, _: object = None) -> Array:
+    """Of each edge at the widths of a state."""
+    now = _problem(graph, state.parts, state.width)
+    return now.trust(now.squares(T))
 
 
 def _problem(

@@ -6,9 +6,10 @@ are differentiated through that equation, not through the loop that found them.
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxreg.averaging.laplacian import solve_laplacian
 from jaxreg.geometry import lie
@@ -17,6 +18,34 @@ from jaxreg.graph.pose_graph import PoseGraph, product
 
 #: More of them are solved for by GMRES.
 DENSE_UNKNOWNS = 400
+
+
+class _Balance(eqx.Module):
+    """What the poses depend on; all but the graph and `imbalance` is held."""
+
+    graph: PoseGraph
+    imbalance: Callable[[PoseGraph, Array], Array]
+    fixed: Float[Array, "v D D"]
+    free: Bool[Array, "v 1"]
+    weight: Float[Array, " e"]
+    precondition: Callable[[Array], Array] | None
+
+    def residual(self, x: Float[Array, "v k"]) -> Float[Array, "v k"]:
+        """The imbalance at left tangents; of frames that are held, the tangent."""
+        balance = self.imbalance(self.graph, product(lie.exp(x), self.fixed))
+        return jnp.where(self.free, balance, x)
+
+    def solve(self, linear: Callable[[Array], Array], y: Array) -> Array:
+        """X of linear(x) = y, the derivative of the residual or its transpose."""
+        if y.size <= DENSE_UNKNOWNS:
+            return _dense(linear, y)
+        if self.precondition is not None:
+            return _krylov(linear, y, self.precondition)
+        return _krylov(linear, y, lambda r: solve_laplacian(*self._flow, -r))
+
+    @property
+    def _flow(self) -> tuple[Array, Array]:
+        return self.graph.edges, self.weight
 
 
 def differentiable(
@@ -28,66 +57,60 @@ def differentiable(
 ) -> Float[Array, "v D D"]:
     """The same poses, with derivatives with respect to the values of the graph.
 
+    Nothing is traced for them until they are asked for, so the two functions are
+    pytrees (`eqx.Partial`) of the arrays that they use.
+
     Args:
         graph: the graph with the values to differentiate.
         T_world_i: a fixed point, frame 0 at the identity.
         imbalance: `(v, k)` at given poses, 0 at the fixed point; its derivative with
-            respect to left tangents of the poses is near to minus the Laplacian.
+            respect to left tangents of the poses is near to minus the Laplacian. It may
+            hold values to differentiate, too.
         weight: `(e,)` Laplacian weights of at most 1; frames without any are held.
         precondition: maps `(v, k)` by about the inverse of that derivative, for graphs
             that are too large for a dense matrix; by default the inverse Laplacian.
     """
     fixed, weight = jax.lax.stop_gradient((T_world_i, weight))
-    num, k = fixed.shape[0], lie.tangent_dim(graph.dim)
-    touched = jnp.zeros((num,), weight.dtype)
-    touched = (
-        touched.at[graph.edges[:, 0]].add(weight).at[graph.edges[:, 1]].add(weight)
-    )
-    free = (touched > 0).at[0].set(False)[:, None]
-
-    def residual(x: Array) -> Array:
-        tangent = x.reshape(num, k)
-        balance = imbalance(graph, product(lie.exp(tangent), fixed))
-        return jnp.where(free, balance, tangent).reshape(-1)
-
-    small = num * k <= DENSE_UNKNOWNS
-    if precondition is None:
-        precondition = _inverse_laplacian(graph.edges, weight)
-    solver = _dense if small else _krylov(precondition, k)
-
-    def tangent_solve(linear: Callable[[Array], Array], y: Array) -> Array:
-        return jax.lax.custom_linear_solve(linear, y, solver, solver)
-
-    x = jax.lax.custom_root(
-        residual,
-        jnp.zeros((num * k,), fixed.dtype),
-        lambda _, x: x,
-        tangent_solve,
-    )
-    return product(lie.exp(x.reshape(num, k)), fixed)
+    i, j = graph.edges[:, 0], graph.edges[:, 1]
+    touched = jnp.zeros(fixed.shape[:1], weight.dtype).at[i].add(weight)
+    free = (touched.at[j].add(weight) > 0).at[0].set(False)[:, None]
+    x = _correction(_Balance(graph, imbalance, fixed, free, weight, precondition))
+    return product(lie.exp(x), fixed)
 
 
-_Solver = Callable[[Callable[[Array], Array], Array], Array]
+@eqx.filter_custom_jvp
+def _correction(at: _Balance) -> Float[Array, "v k"]:
+    """The tangents from the fixed point to the balance: zero, with derivatives."""
+    zero = jnp.zeros((len(at.fixed), lie.tangent_dim(at.graph.dim)), at.fixed.dtype)
+    # A constant has no lanes under `vmap`, but its tangent has: JAX mixes them up.
+    return jnp.where(jnp.isnan(at.fixed[:, :1, 0]), -zero, zero)
+
+
+@_correction.def_jvp
+def _correction_jvp(primals: tuple[_Balance], tangents: tuple) -> tuple[Array, Array]:
+    (at,), zero = primals, _correction(*primals)
+    along = eqx.filter_jvp(lambda at: at.residual(zero), primals, tangents)[1]
+    if along is None:  # nothing that is differentiated has an influence
+        return zero, jnp.zeros_like(zero)
+    linear = jax.linearize(at.residual, zero)[1]
+    return zero, -jax.lax.custom_linear_solve(linear, along, at.solve, at.solve)
 
 
 def _dense(linear: Callable[[Array], Array], y: Array) -> Array:
-    columns = jax.vmap(linear)(jnp.eye(y.shape[0], dtype=y.dtype))
-    return jnp.linalg.solve(columns.T, y)
+    eye = jnp.eye(y.size, dtype=y.dtype).reshape(-1, *y.shape)
+    columns = jax.vmap(linear)(eye).reshape(y.size, y.size)
+    return jnp.linalg.solve(columns.T, y.reshape(-1)).reshape(y.shape)
 
 
-def _inverse_laplacian(edges: Array, weight: Array) -> Callable[[Array], Array]:
-    return lambda rows: solve_laplacian(edges, weight, -rows)
-
-
-def _krylov(precondition: Callable[[Array], Array], k: int) -> _Solver:
-    def solve(linear: Callable[[Array], Array], y: Array) -> Array:
-        def held(r: Array) -> Array:
-            rows = r.reshape(-1, k)
-            return precondition(rows).at[0].set(rows[0]).reshape(-1)
-
-        tolerance = 100 * float(jnp.finfo(y.dtype).eps)
-        return jax.scipy.sparse.linalg.gmres(
-            linear, y, tol=tolerance, restart=20, maxiter=10, M=held
-        )[0]
-
-    return solve
+def _krylov(
+    linear: Callable[[Array], Array], y: Array, precondition: Callable[[Array], Array]
+) -> Array:
+    tolerance = 100 * float(jnp.finfo(y.dtype).eps)
+    return jax.scipy.sparse.linalg.gmres(
+        linear,
+        y,
+        tol=tolerance,
+        restart=20,
+        maxiter=10,
+        M=lambda r: precondition(r).at[0].set(r[0]),
+    )[0]

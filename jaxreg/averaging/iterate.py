@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -83,19 +84,26 @@ def averaged(
 def averaging_gradients(
     graph: PoseGraph, end: Iterated, trust_of: TrustOf, rows_of: RowsOf
 ) -> Iterated:
-    """The same result with derivatives by the balance of flows at the fixed point."""
+    """The same result with derivatives by the balance of flows at the fixed point.
+
+    `trust_of` is a pytree of the values that it uses.
+    """
     fixed = jax.lax.stop_gradient(graph)
     held = rows_of(fixed, end.trust)
     top = jnp.max(held)
-    held = held / jnp.where(top > 0, top, 1)
-
-    def imbalance(g: PoseGraph, T: Array) -> Array:
-        weight = rows_of(g, trust_of(g, T, end.width)) / jnp.where(top > 0, top, 1)
-        flow = weight[:, None] * lie.log(g.residual_motions(T))
-        return divergence(g.edges, flow, g.num_poses)
-
-    T = differentiable(graph, end.T_world_i, imbalance, held)
+    top = jnp.where(top > 0, top, 1)
+    imbalance = eqx.Partial(_net_flow, trust_of, rows_of, end.width, top)
+    T = differentiable(graph, end.T_world_i, imbalance, held / top)
     return end._replace(T_world_i=T, trust=trust_of(graph, T, end.width))
+
+
+def _net_flow(
+    trust_of: TrustOf, rows_of: RowsOf, width: Array, top: Array, g: PoseGraph, T: Array
+) -> Array:
+    """What flows into each frame, by weights over the largest."""
+    weight = rows_of(g, trust_of(g, T, width)) / top
+    flow = weight[:, None] * lie.log(g.residual_motions(T))
+    return divergence(g.edges, flow, g.num_poses)
 
 
 def iterate(

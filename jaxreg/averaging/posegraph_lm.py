@@ -125,21 +125,16 @@ class PoseGraphLM(AbstractAverager):
         self, graph: PoseGraph, problem: "Problem", T: Float[Array, "v D D"]
     ) -> Float[Array, "v D D"]:
         """The same poses, with derivatives by the balance of forces at the minimum."""
-        Q, num = problem.normal(T)[0], graph.num_poses
+        Q = problem.normal(T)[0]
         stiffness = jnp.trace(Q, axis1=-2, axis2=-1)
         top = jnp.max(stiffness)
-
-        def imbalance(g: PoseGraph, T: Array) -> Array:
-            return -divergence(g.edges, self._problem(g).normal(T)[1], num)
-
-        def precondition(rows: Array) -> Array:
-            # What arrives at pose 0 leaves the others.
-            rows = rows.at[0].set(-jnp.sum(rows[1:], axis=0))
-            x = multigrid(anchored(graph.edges, Q, num))(-rows[..., None])[..., 0]
-            return x - x[0]
-
         weight = stiffness / jnp.where(top > 0, top, 1)
-        return differentiable(graph, T, imbalance, weight, precondition)
+        precondition = eqx.Partial(_nearly_balanced, graph.edges, Q)
+        return differentiable(graph, T, self._imbalance, weight, precondition)
+
+    def _imbalance(self, graph: PoseGraph, T: Array) -> Array:
+        force = self._problem(graph).normal(T)[1]
+        return -divergence(graph.edges, force, graph.num_poses)
 
     def _problem(self, graph: PoseGraph) -> "Problem":
         if self.objective == "chordal":
@@ -150,6 +145,14 @@ class PoseGraphLM(AbstractAverager):
             return Problem(graph, error, precision, lambda s: s, jnp.ones_like)
         width = jnp.asarray(self.kernel_width)
         return robust_problem(graph, error, precision, self.kernel, width)
+
+
+def _nearly_balanced(edges: Array, Q: Array, rows: Array) -> Array:
+    """Tangents that about undo an imbalance."""
+    # What arrives at pose 0 leaves the others.
+    rows = rows.at[0].set(-jnp.sum(rows[1:], axis=0))
+    x = multigrid(anchored(edges, Q, len(rows)))(-rows[..., None])[..., 0]
+    return x - x[0]
 
 
 class Problem(NamedTuple):

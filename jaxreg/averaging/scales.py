@@ -66,22 +66,24 @@ def annealed_width(
 
 @eqx.filter_custom_jvp
 def followed_width(
-    at: tuple[PoseGraph, Float[Array, "v D D"], Float[Array, "2"], Float[Array, ""]],
+    scale: Float[Array, ""],
+    graph: PoseGraph,
+    T_world_i: Float[Array, "v D D"],
+    width: Float[Array, "2"],
 ) -> Float[Array, "2"]:
     """The width of arguments of `annealed_width`, with derivatives if it has settled.
 
     Then it is three deviations of the edges inside itself, and follows motions, weights
     and poses by that equation; a width that would grow, but may not, is held.
     """
-    return at[2]
+    return width
 
 
 @followed_width.def_jvp
 def _followed_width_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    graph, T_world_i, width, scale = primals[0]
-    moved = (*tangents[0][:2], None, None)
+    scale, graph, T_world_i, width = primals
     target, change = eqx.filter_jvp(
-        lambda g, T, w, s: _three_deviations(g, T, w, s), primals[0], moved
+        lambda g, T: _three_deviations(g, T, width, scale), primals[1:3], tangents[1:3]
     )
     by_width = jax.jacfwd(lambda w: _three_deviations(graph, T_world_i, w, scale))
     settled = jnp.abs(target - width) < _SETTLED * width

@@ -9,7 +9,7 @@ is `PointToPoint` with `Huber` and `LevenbergMarquardt`.
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.adjoint import AbstractAdjoint, ImplicitAdjoint
 from jaxreg._core.arrays import cast_floats, traced
@@ -150,13 +150,9 @@ class ICP(AbstractRegistrar):
         back = self._score_of_target(
             source, target, lax.stop_gradient(T), scale, spacing
         )
-        status = jnp.where(end.moving, Status.MAX_STEPS, Status.CONVERGED)
-        degenerate = is_degenerate(self.residual, frozen_found, weight)
-        status = jnp.where(degenerate, Status.DEGENERATE, status)
-        status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
-        status = jnp.where(worse, Status.DIVERGED, status)
+        free = is_degenerate(self.residual, frozen_found, weight)
         T = lie.compose(scale * lie.rotation(T), lie.translation(T))
-        status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
+        status = _status(T, end.moving, free, there, worse)
         curvature = Curvature.of(
             optimiser, problem.scaled(scale), end.T_matched, found, end.width
         )
@@ -164,7 +160,7 @@ class ICP(AbstractRegistrar):
         modes = Modes.alone(T, there.fitness, overlap, rmse, curvature.covariance)
         return RegistrationSolution(
             T_target_source=T,
-            status=status.astype(jnp.int32),
+            status=status,
             fitness=there.fitness,
             inlier_rmse=rmse,
             num_inliers=there.num_inliers,
@@ -248,3 +244,19 @@ class ICP(AbstractRegistrar):
         some = problem.of_rows(rows)
         some = eqx.tree_at(lambda p: p.source_mask, some, use)
         return score(some, lie.inverse(T), spacing)
+
+
+def _status(
+    T: Motion,
+    moving: Bool[Array, ""],
+    free: Bool[Array, ""],
+    there: Score,
+    worse: Bool[Array, ""],
+) -> Int[Array, ""]:
+    """Of the answer `T`, the most serious last."""
+    status = jnp.where(moving, Status.MAX_STEPS, Status.CONVERGED)
+    status = jnp.where(free, Status.DEGENERATE, status)
+    status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
+    status = jnp.where(worse, Status.DIVERGED, status)
+    status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
+    return status.astype(jnp.int32)

@@ -68,6 +68,8 @@ def _correction(at: _End) -> Float[Array, " k"]:
 def _correction_jvp(primals: tuple[_End], tangents: tuple) -> tuple[Array, Array]:
     (at,), zero = primals, _correction(*primals)
     along = eqx.filter_jvp(lambda at: _pulls(zero, at), primals, tangents)[1]
+    if along is None:  # nothing that is differentiated has an influence
+        return zero, jnp.zeros_like(zero)
     A = jax.jacfwd(lambda x: _pulls(x, at))(zero)
     # Directions that the data leave free do not follow.
     U, s, Vt = jnp.linalg.svd(A)

@@ -130,10 +130,8 @@ def conclude(
         pair.problem, kernel, T_modes, overlap >= 0, 0.5 * spacing, steps
     )
     best, curvature = jax.tree.map(lambda x: x[0], (there, curvatures))
-    rival = (overlap[1:] > RIVAL_OVERLAP * overlap[0]) | (
-        weight[1:] > _RIVAL_WEIGHT * weight[0]
-    )
-    doubtful = jnp.any(rival) | can_slip(pair.problem, T_modes[0], spacing)
+    doubtful = _has_rival(overlap, weight)
+    doubtful |= can_slip(pair.problem, T_modes[0], spacing)
     status = _status(
         overlap[0], doubtful, pair, min_overlap, finished | (refine_steps > 0)
     )
@@ -158,6 +156,14 @@ def conclude(
             curvatures.covariance,
         ),
     )
+
+
+def _has_rival(
+    overlap: Float[Array, " q"], weight: Float[Array, " q"]
+) -> Bool[Array, ""]:
+    """Whether another mode is about as good as the first."""
+    as_large = overlap[1:] > RIVAL_OVERLAP * overlap[0]
+    return jnp.any(as_large | (weight[1:] > _RIVAL_WEIGHT * weight[0]))
 
 
 def _weights(overlap: Float[Array, " q"], pair: Pair) -> Float[Array, " q"]:
