@@ -7,8 +7,10 @@ minutes over a chain of `where` in which each condition and each value use the l
 write such a chain as a minimum.
 """
 
+import contextlib
 import functools
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -38,10 +40,27 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         leaves = jax.tree.leaves((args, kwargs))
-        eager = get_opaque_trace_state() == _EAGER and all(map(is_concrete, leaves))
-        return (quicker if eager and _known() else plain)(*args, **kwargs)
+        if get_opaque_trace_state() != _EAGER or not all(map(is_concrete, leaves)):
+            return plain(*args, **kwargs)
+        with _no_collection():
+            return (quicker if _known() else plain)(*args, **kwargs)
 
     return call
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without garbage collection: none of the many objects that tracing makes is lost.
+
+    Looking through them again and again takes up to a tenth of a first call.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @functools.cache

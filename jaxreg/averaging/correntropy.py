@@ -5,7 +5,7 @@ Criterion (the MCC paper): Algorithm 1, with the update of Eq. 21 on the left, w
 Eq. 14 needs it, and "until change is negligible and k >= K" read as "or".
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -158,20 +158,18 @@ class Correntropy(AbstractAverager):
         narrow = jnp.minimum(width, _NARROW * jnp.stack([scale, jnp.ones_like(scale)]))
         doubt = (width[1] > _NARROW) | jnp.any(T_wide != T_start)
 
-        def unfinished(s: tuple[Array, Iterated, Array]) -> Array:
-            return s[0] < jnp.where(doubt, 2, 1)
-
-        def tried(s: tuple[Array, Iterated, Array]) -> tuple[Array, Iterated, Array]:
-            first = s[0] == 0
+        def tried(number: Array, best: _Tried) -> _Tried:
+            first = number == 0
             T = jnp.where(first, T_wide, T_start)
             end = self._from_width(fixed, T, jnp.where(first, width, narrow))
             score = coherence(fixed, end.T_world_i, scale)
             # A kernel narrower than the noise fits a tree, and little beyond.
             spare = redundancy(fixed, end.T_world_i)
-            enough = spare > _ENOUGH * redundancy(fixed, s[1].T_world_i)
-            better = first | ((score > s[2]) & enough)
-            best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, s[1])
-            return s[0] + 1, best, jnp.where(better, score, s[2])
+            better = first | (
+                (score > best.score) & (spare > _ENOUGH * best.redundancy)
+            )
+            new = _Tried(end, score, spare)
+            return jax.tree.map(lambda new, old: jnp.where(better, new, old), new, best)
 
         zero = jnp.asarray(0, jnp.int32)
         none = Iterated(
@@ -182,9 +180,8 @@ class Correntropy(AbstractAverager):
             zero,
             AveragingTrace.of(no_rows(self.max_steps, width.dtype), zero),
         )
-        low = jnp.asarray(-jnp.inf, width.dtype)
-        start = (zero, none, low)
-        end = jax.lax.while_loop(unfinished, tried, start)[1]
+        none = _Tried(none, jnp.zeros_like(scale), jnp.zeros_like(scale))
+        end = jax.lax.fori_loop(0, jnp.where(doubt, 2, 1), tried, none).end
         return gauss_newton_gradients(graph, end, gaussian_trust, followed)
 
     def _from_width(self, graph: PoseGraph, T_start: Array, width: Array) -> Iterated:
@@ -213,6 +210,14 @@ class Correntropy(AbstractAverager):
             # pulls against them would bend it for good.
             starts = [_better_start(graph, init, rows, graph)]
         return graduated(graph, near, jnp.stack(starts), self.max_steps)
+
+
+class _Tried(NamedTuple):
+    """Where a start led, and how well that agrees."""
+
+    end: Iterated
+    score: Array
+    redundancy: Array
 
 
 def _solution(graph: PoseGraph, end: Iterated) -> AveragingSolution:
@@ -256,5 +261,6 @@ def _better_start(
     it agrees with few, and the start stands. The steps have the weights of `near`.
     """
     plain = iterate_plain(near, T_start, rows, max_steps=5, tolerance=1e-2)
-    better = redundancy(graph, plain.T_world_i) > redundancy(graph, T_start)
-    return jnp.where(better, plain.T_world_i, T_start)
+    both = jnp.stack([T_start, plain.T_world_i])
+    spare = jax.vmap(lambda T: redundancy(graph, T))(both)
+    return jnp.where(spare[1] > spare[0], both[1], both[0])

@@ -30,9 +30,11 @@ class _Balance(eqx.Module):
     weight: Float[Array, " e"]
     precondition: Callable[[Array], Array] | None
 
-    def residual(self, x: Float[Array, "v k"]) -> Float[Array, "v k"]:
+    def residual(
+        self, x: Float[Array, "v k"], T_world_i: Float[Array, "v D D"]
+    ) -> Float[Array, "v k"]:
         """The imbalance at left tangents; of frames that are held, the tangent."""
-        balance = self.imbalance(self.graph, product(lie.exp(x), self.fixed))
+        balance = self.imbalance(self.graph, product(lie.exp(x), T_world_i))
         return jnp.where(self.free, balance, x)
 
     def solve(self, linear: Callable[[Array], Array], y: Array) -> Array:
@@ -74,26 +76,25 @@ def differentiable(
     i, j = graph.edges[:, 0], graph.edges[:, 1]
     touched = jnp.zeros(fixed.shape[:1], weight.dtype).at[i].add(weight)
     free = (touched.at[j].add(weight) > 0).at[0].set(False)[:, None]
-    x = _correction(_Balance(graph, imbalance, fixed, free, weight, precondition))
-    return product(lie.exp(x), fixed)
+    return _balanced(_Balance(graph, imbalance, fixed, free, weight, precondition))
 
 
 @eqx.filter_custom_jvp
-def _correction(at: _Balance) -> Float[Array, "v k"]:
-    """The tangents from the fixed point to the balance: zero, with derivatives."""
-    zero = jnp.zeros((len(at.fixed), lie.tangent_dim(at.graph.dim)), at.fixed.dtype)
-    # A constant has no lanes under `vmap`, but its tangent has: JAX mixes them up.
-    return jnp.where(jnp.isnan(at.fixed[:, :1, 0]), -zero, zero)
+def _balanced(at: _Balance) -> Float[Array, "v D D"]:
+    """The poses at which forces balance: those given, with derivatives."""
+    return at.fixed
 
 
-@_correction.def_jvp
-def _correction_jvp(primals: tuple[_Balance], tangents: tuple) -> tuple[Array, Array]:
-    (at,), zero = primals, _correction(*primals)
-    along = eqx.filter_jvp(lambda at: at.residual(zero), primals, tangents)[1]
+@_balanced.def_jvp
+def _balanced_jvp(primals: tuple[_Balance], tangents: tuple) -> tuple[Array, Array]:
+    (at,), T = primals, _balanced(*primals)
+    still = jnp.zeros((len(T), lie.tangent_dim(at.graph.dim)), T.dtype)
+    along = eqx.filter_jvp(lambda at: at.residual(still, T), primals, tangents)[1]
     if along is None:  # nothing that is differentiated has an influence
-        return zero, jnp.zeros_like(zero)
-    linear = jax.linearize(at.residual, zero)[1]
-    return zero, -jax.lax.custom_linear_solve(linear, along, at.solve, at.solve)
+        return T, jnp.zeros_like(T)
+    linear = jax.linearize(lambda x: at.residual(x, T), still)[1]
+    x = -jax.lax.custom_linear_solve(linear, along, at.solve, at.solve)
+    return T, jax.jvp(lambda x: product(lie.exp(x), T), (still,), (x,))[1]
 
 
 def _dense(linear: Callable[[Array], Array], y: Array) -> Array:
