@@ -70,8 +70,9 @@ class ICP(AbstractRegistrar):
 
     Fails: TOO_FEW_POINTS, NON_FINITE, MAX_STEPS; LOW_OVERLAP where nothing agrees;
     DEGENERATE where the matched surfaces leave a direction free (it is left as in the
-    guess); DIVERGED where the end fits worse than the guess, which is returned
-    (the scores are those of the end).
+    guess); DIVERGED where the end fits worse than the guess by more than the
+    standard error of their sums; then the guess is returned (the scores are those of
+    the end).
 
     Gradients: with respect to both clouds and `width_end`, exact by the implicit
     function theorem where the loop has converged, in forward and reverse mode.
@@ -213,7 +214,7 @@ class ICP(AbstractRegistrar):
     def _worse_than(
         self, end: Descent, problem: Problem, found: Match, limits: Limits
     ) -> Bool[Array, ""]:
-        """Whether the guess fits better than the match at the end."""
+        """Whether the guess fits better than the match at the end, beyond chance."""
         every = limits.stride(found.mask.shape[0])
         mask = problem.every(every).source_mask
         # A guess that fits exactly is not better than an end that fits up to rounding.
@@ -224,7 +225,10 @@ class ICP(AbstractRegistrar):
             return jnp.sum(jnp.where(mask, self.kernel.rho(sq, end.width), 0))
 
         last = found.sq_residual[::every]
-        return loss(end.first_sq_residual[: len(last)]) < 0.999 * loss(last)
+        # Near the solution matches are exchanged: the sum is known to its standard
+        # error, and a guess is not worth more than an end within that.
+        chance = lax.rsqrt(jnp.maximum(jnp.sum(mask), 1).astype(end.width.dtype))
+        return loss(end.first_sq_residual[: len(last)]) < (1 - chance) * loss(last)
 
     def _score_of_target(
         self,
