@@ -463,6 +463,7 @@ TWO = {"target": [CUBE] * 2}
         ({"key": jnp.ones(3)}, TypeError, "key.*float32"),
         ({"key": None}, ValueError, r"key.*jax\.random\.key"),
         ({"method": "icp"}, TypeError, "method.*str"),
+        ({"batch_size": 0}, ValueError, "batch_size.*at least 1, found 0"),
         ({"source": [CUBE] * 2}, TypeError, "target.*a list"),
         ({"source": [CUBE] * 2, "target": [CUBE]}, ValueError, "length.* 2 and 1"),
         ({"source": [CUBE, CUBE[:, :2]], **TWO}, ValueError, r"source\[1\].*\(n, 3\)"),
