@@ -8,6 +8,7 @@ import _thread
 import io
 import os
 import shlex
+import signal
 import sys
 import threading
 from collections.abc import Sequence
@@ -37,9 +38,18 @@ def command() -> NoReturn:
 def _heard_again(lost: "sys.UnraisableHookArgs") -> None:
     """Interrupts again if Python dropped it, as in callbacks of garbage collection."""
     if isinstance(lost.exc_value, KeyboardInterrupt):
-        threading.Timer(0.1, _thread.interrupt_main).start()
+        threading.Timer(0.1, _interrupt).start()
     else:
         sys.__unraisablehook__(lost)
+
+
+def _interrupt() -> None:
+    """As Ctrl-C does: wakes the main thread from a system call, too."""
+    main_thread = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main_thread is not None:
+        signal.pthread_kill(main_thread, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
