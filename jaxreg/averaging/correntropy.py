@@ -172,7 +172,7 @@ class Correntropy(AbstractAverager):
             return jax.tree.map(lambda new, old: jnp.where(better, new, old), new, best)
 
         zero = jnp.asarray(0, jnp.int32)
-        none = Iterated(
+        nowhere = Iterated(
             T_start,
             jnp.zeros_like(graph.weight),
             width,
@@ -180,7 +180,7 @@ class Correntropy(AbstractAverager):
             zero,
             AveragingTrace.of(no_rows(self.max_steps, width.dtype), zero),
         )
-        none = _Tried(none, jnp.zeros_like(scale), jnp.zeros_like(scale))
+        none = _Tried(nowhere, jnp.zeros_like(scale), jnp.zeros_like(scale))
         end = jax.lax.fori_loop(0, jnp.where(doubt, 2, 1), tried, none).end
         return gauss_newton_gradients(graph, end, gaussian_trust, followed)
 

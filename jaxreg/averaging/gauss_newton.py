@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg.averaging.implicit import differentiable
-from jaxreg.averaging.iterate import Iterated, TrustOf, WidthOf
+from jaxreg.averaging.iterate import Iterated, TrustOf, WidthOf, held_width
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 
@@ -109,11 +109,6 @@ def gauss_newton_step(
     )
     tangent = -(inverse_root * x[:, 0]).reshape(graph.num_poses, -1)
     return product(T_world_i, lie.exp(tangent))
-
-
-def held_width(graph: PoseGraph, T: Array, width: Array) -> Array:
-    """The width as it is, without derivatives."""
-    return width
 
 
 def gauss_newton_gradients(

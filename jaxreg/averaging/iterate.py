@@ -28,6 +28,11 @@ RowsOf = Callable[[PoseGraph, Array], Array]
 Step = Callable[[PoseGraph, Array, Array, Array], Array]
 
 
+def held_width(graph: PoseGraph, T: Array, width: Array) -> Array:
+    """The width as it is, without derivatives."""
+    return width
+
+
 class Iterated(NamedTuple):
     """Where the loop stopped."""
 

@@ -21,6 +21,7 @@ from jaxreg.averaging.iterate import (
     RowsOf,
     averaged,
     averaging_gradients,
+    held_width,
     iterate,
 )
 from jaxreg.averaging.laplacian import flow_solver
@@ -144,14 +145,11 @@ def iterate_plain(
     weight = rows(graph, jnp.ones_like(graph.weight))
     solve = flow_solver(graph.edges, weight, graph.num_poses, STEP_TOLERANCE)
 
-    def same_width(g: PoseGraph, T: Array, width: Array) -> Array:
-        return width
-
     return iterate(
         graph,
         T_start,
         jnp.full((2,), jnp.inf, T_start.dtype),
-        same_width,
+        held_width,
         _full_trust,
         lambda g, T, trust, width: averaged(g, T, solve),
         max_steps=max_steps,

@@ -130,11 +130,9 @@ def conclude(
         pair.problem, kernel, T_modes, overlap >= 0, 0.5 * spacing, steps
     )
     best, curvature = jax.tree.map(lambda x: x[0], (there, curvatures))
-    doubtful = _has_rival(overlap, weight)
-    doubtful |= can_slip(pair.problem, T_modes[0], spacing)
-    status = _status(
-        overlap[0], doubtful, pair, min_overlap, finished | (refine_steps > 0)
-    )
+    doubtful = can_slip(pair.problem, T_modes[0], spacing) | _has_rival(overlap, weight)
+    finished = finished | (refine_steps > 0)
+    status = _status(overlap[0], doubtful, pair, min_overlap, finished)
     return RegistrationSolution(
         T_target_source=T_modes[0],
         status=status,
