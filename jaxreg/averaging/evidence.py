@@ -69,9 +69,14 @@ def redundancies(graph: PoseGraph, T_world_i: Array) -> Float[Array, " s"]:
     A chain of motions agrees with its own edges, however far it drifts.
     """
     count = votes(graph)
-    usual = jnp.sum(count) / jnp.maximum(jnp.sum(count > 0), 1)
-    free = (num_held(graph) - 1) * usual
+    free = _free(graph, count)
     return jnp.maximum(_agreed(graph, T_world_i, length_scale(graph)) - free, 0)
+
+
+def _free(graph: PoseGraph, count: Float[Array, " e"]) -> Float[Array, ""]:
+    """What the edges of a tree count."""
+    usual = jnp.sum(count) / jnp.maximum(jnp.sum(count > 0), 1)
+    return (num_held(graph) - 1) * usual
 
 
 def redundancy(graph: PoseGraph, T_world_i: Array) -> Array:
@@ -100,8 +105,10 @@ def coherence(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     count = votes(graph)
     agreed = agrees(sq)
     if graph.num_edges <= _NEIGHBOURS * graph.num_poses:
-        # Nearly all neighbours are among the nearest: they say nothing else.
-        return weighted_mean(agreed, count)
+        # Nearly all neighbours are among the nearest: they say nothing else. But a tree
+        # agrees with its own edges, which are many of these.
+        spare = jnp.sum(count) - _free(graph, count)
+        return redundancy(graph, T_world_i) / jnp.maximum(len(SCALES) * spare, 1)
     i, j, num = graph.edges[:, 0], graph.edges[:, 1], graph.num_poses
     gap = product(lie.inverse(T_world_i)[i], T_world_i[j])
     near = graph.dim - jnp.trace(lie.rotation(gap), axis1=-2, axis2=-1)
