@@ -44,6 +44,8 @@ _COARSE, _FINE = 1e-3, 1e-6
 _ROUNDS = 24
 # The next width is the last one where it is no narrower than this share.
 _SAME = 0.9
+# Wide enough to be none.
+_NO_KERNEL = 1e6
 # No other start is tried if this share of the redundant edges is trusted.
 _SETTLED = 0.99
 # The first width of chained starts: so many times the error at this quantile of the
@@ -79,7 +81,8 @@ def graduated(
     """The best of the ends from several starts, tried until one leaves few edges out.
 
     Each start takes rounds of minimisation, at most `max_steps` steps each, under
-    narrower and narrower kernels. `near` is the graph `without_lone_closures`: those
+    narrower and narrower kernels. The last that is tried takes no edge for wrong: from
+    the best end without a kernel. `near` is the graph `without_lone_closures`: those
     are wrong as a rule, so they do not count in the wide kernels, and leaving them out
     is no reason to search on.
 
@@ -90,7 +93,9 @@ def graduated(
     doubt = near.weight / jnp.where(fixed.weight > 0, fixed.weight, 1)
 
     def attempt(b: _Best) -> _Best:
-        end = _narrowed(fixed, doubt, starts[b.tried], max_steps)
+        every = b.tried == starts.shape[0]
+        T_start = jnp.where(every, b.end.found.T, starts[b.tried])
+        end = _narrowed(fixed, doubt, T_start, every, max_steps)
         trust = _trust_at(end, fixed, end.found.T)
         score = redundancy(fixed, end.found.T)
         steps = b.end.found.step + end.found.step
@@ -106,13 +111,13 @@ def graduated(
         )
 
     begin = _Best(
-        _before(fixed, doubt, starts[0]),
+        _before(fixed, doubt, starts[0], jnp.asarray(False)),
         -jnp.ones((), starts.dtype),
         jnp.asarray(0, jnp.int32),
         jnp.asarray(False),
     )
     end = jax.lax.while_loop(
-        lambda b: (b.tried < starts.shape[0]) & ~b.settled, attempt, begin
+        lambda b: (b.tried <= starts.shape[0]) & ~b.settled, attempt, begin
     ).end
     result = Iterated(
         end.found.T,
@@ -141,23 +146,27 @@ def _problem(
     )
 
 
-def _before(graph: PoseGraph, doubt: Array, T_start: Array) -> _State:
-    """Nothing minimised yet."""
+def _before(graph: PoseGraph, doubt: Array, T_start: Array, every: Array) -> _State:
+    """Nothing minimised yet; the first width is the last if every edge is to count."""
     parts = _parts(graph, T_start, jnp.ones_like(graph.weight))
     squares = _problem(graph, parts, jnp.ones_like(parts[0])).squares(T_start)
     width = _first_width(graph, doubt == 1, T_start, squares)
+    width = jnp.where(every, _NO_KERNEL, width)
     none = jnp.asarray(0, jnp.int32)
     cycle = no_cycle(_problem(graph, parts, width), T_start)
     start = Minimum(T_start, jnp.asarray(False), none, cycle, None)
-    unlimited = jnp.full_like(width, jnp.inf)
+    before = jnp.where(every, width, jnp.inf)
     rows, no = no_rows(_ROUNDS + 1, T_start.dtype), jnp.asarray(False)
-    return _State(start, parts, unlimited, width, none, no, rows)
+    return _State(start, parts, before, width, none, no, rows)
 
 
-def _narrowed(graph: PoseGraph, doubt: Array, T_start: Array, max_steps: int) -> _State:
+def _narrowed(
+    graph: PoseGraph, doubt: Array, T_start: Array, every: Array, max_steps: int
+) -> _State:
     """Minimises under narrower kernels until the edges inside fill the kernel.
 
-    Then once more with all edges, to the end.
+    Then once more with all edges, to the end; at once and without a kernel if `every`
+    edge is to count.
     """
 
     def turn(s: _State) -> _State:
@@ -181,7 +190,7 @@ def _narrowed(graph: PoseGraph, doubt: Array, T_start: Array, max_steps: int) ->
         return _State(new, parts, s.next_width, width, s.round + 1, last, rows)
 
     scale = length_scale(graph)
-    start = _before(graph, doubt, T_start)
+    start = _before(graph, doubt, T_start, every)
     return jax.lax.while_loop(lambda s: ~s.done, turn, start)
 
 

@@ -99,10 +99,12 @@ def folding_graph(
     return X, folded, edges, T @ error
 
 
-def noisy_grid(num: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def noisy_grid(
+    num: int, seed: int, noise: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses on a cubic grid of that many, edges to the next, and their motions.
 
-    Noise is 14 degrees and a tenth of the distance; no three edges form a cycle.
+    Noise, at 1, is 14 degrees and a tenth of the distance; no three edges form a cycle.
     """
     rng = np.random.default_rng(seed)
     axes = np.meshgrid(*[np.arange(num)] * 3, indexing="ij")
@@ -111,6 +113,7 @@ def noisy_grid(num: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     apart = np.abs(place[:, None] - place).sum(axis=-1)
     edges = np.argwhere(np.triu(apart == 1))
     error = motions(
-        rotations(rng, len(edges), 3, 0.25), 0.1 * rng.normal(size=(len(edges), 3))
+        rotations(rng, len(edges), 3, 0.25 * noise),
+        0.1 * noise * rng.normal(size=(len(edges), 3)),
     )
     return X, edges, np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ error

@@ -10,7 +10,13 @@ from jaxreg.averaging.cycles import NEUTRAL, edge_log_odds, judged
 from jaxreg.averaging.evidence import agreement, coherence
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_error, rotation_errors
-from tests.averaging.graphs import folding_graph, noisy_grid, random_graph
+from tests.averaging.graphs import (
+    folding_graph,
+    motions,
+    noisy_grid,
+    random_graph,
+    rotations,
+)
 
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -159,12 +165,32 @@ def test_settled_graphs_need_no_hypotheses():
 
 
 def test_noise_alone_is_not_taken_for_outliers():
-    for seed in range(2):
-        X, edges, T = noisy_grid(4, seed)
-        graph = PoseGraph.from_edges(edges, T.astype(np.float32))
-        found = average(graph)
+    X, edges, T = noisy_grid(4, 0)
+    graph = PoseGraph.from_edges(edges, T.astype(np.float32))
+    truth = jnp.asarray(X, jnp.float32)
+    least_squares = average(graph, PoseGraphLM()).T_world_i
+    for key in (None, jax.random.key(1)):
+        found = average(graph, key=key)
         assert np.mean(np.asarray(found.edge_weight) > 0.5) > 0.9
-        truth = jnp.asarray(X, jnp.float32)
         error = rotation_error(found.T_world_i, truth, "best")
-        least_squares = average(graph, PoseGraphLM()).T_world_i
         assert error < 1.2 * rotation_error(least_squares, truth, "best")
+
+
+def test_wrong_motions_of_a_noisy_grid_are_found():
+    rng = np.random.default_rng(0)
+    X, edges, T = noisy_grid(4, 0, noise=0.4)
+    wrong = rng.choice(len(edges), len(edges) // 10, replace=False)
+    T[wrong] = motions(
+        rotations(rng, len(wrong), 3, None), rng.uniform(-1.5, 1.5, (len(wrong), 3))
+    )
+    bad = np.isin(np.arange(len(edges)), wrong)
+    graph = PoseGraph.from_edges(edges, T.astype(np.float32))
+    kept = PoseGraph.from_edges(edges, T.astype(np.float32), mask=~bad)
+    truth = jnp.asarray(X, jnp.float32)
+    oracle = rotation_error(average(kept, PoseGraphLM()).T_world_i, truth, "best")
+    for key in (None, jax.random.key(1)):
+        found = average(graph, key=key)
+        trusted = np.asarray(found.edge_weight) > 0.5
+        assert np.mean(trusted[~bad]) > 0.85
+        assert not trusted[bad].any()
+        assert rotation_error(found.T_world_i, truth, "best") < 1.2 * oracle

@@ -6,8 +6,10 @@ from jaxreg import Status
 from jaxreg.averaging import average
 from jaxreg.averaging.laplacian import DENSE_LIMIT
 from jaxreg.graph import PoseGraph
-from jaxreg.metrics import align_poses, translation_errors
+from jaxreg.io import read_g2o
+from jaxreg.metrics import align_poses, chordal_objective, translation_errors
 from tests.averaging.graphs import motions, rotations
+from tests.helpers import data_dir
 
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -69,3 +71,13 @@ def test_false_closures_of_a_large_graph_are_found():
         # Neighbouring places look alike to within the last width of the kernel.
         assert np.mean(trusted[false]) < 0.1
         assert np.mean(trusted[~false]) > 0.99
+
+
+@pytest.mark.data
+def test_few_closures_of_a_long_path_are_not_taken_for_outliers():
+    # 20 closures; the path drifts by half a building.
+    graph = read_g2o(data_dir("pose_graphs", "MIT.g2o"))
+    solution = average(graph)
+    assert solution.status == Status.CONVERGED
+    assert np.mean(np.asarray(solution.edge_weight) > 0.5) > 0.995
+    assert chordal_objective(graph, solution.T_world_i) < 1.1 * 61.1541
