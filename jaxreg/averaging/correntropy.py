@@ -64,7 +64,7 @@ class Correntropy(AbstractAverager):
     start to a larger, less coherent group, so a narrow one is tried, too.
     `width="paper"` is the published Algorithm 1. Larger graphs take `graduated` steps;
     where those leave many edges out, the chain of successive frames is tried as a
-    start, too.
+    start, and that no motion is wrong.
 
     Attributes:
         width: "annealed", or "paper" for sigma_k = alpha e_k with the mean residual
