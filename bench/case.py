@@ -25,7 +25,8 @@ class Method:
 
     Attributes:
         name: in its row.
-        library: the package that is measured, as in `bench.peers.PEERS`, or "jaxreg".
+        library: the package that is measured, as in `bench.peers.PEERS`, or "jaxreg";
+            "published" for figures of a paper, which are `metrics` and not measured.
         parameters: written out for the reader.
         solve: called on every trial.
         prepare: where something is built once for all trials, what returns `solve`;
@@ -34,6 +35,7 @@ class Method:
             that of this one.
         on_accelerator: whether `solve` is JAX on arrays of its own and gets a second
             row where there is an accelerator.
+        metrics: what is known of it without a call.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Method:
     prepare: Callable[[], Solve] | None = None
     in_processes: bool = False
     on_accelerator: bool = False
+    metrics: Sequence[Metric] = ()
 
 
 class Judged(NamedTuple):

@@ -30,6 +30,10 @@ def measure(
     for method in methods:
         row = _described(case, method, blank(method))
         rows[method.name] = row
+        if method.library == "published":
+            known = {m.key: m for m in method.metrics}
+            rows[method.name] = replace(row, metrics=known)
+            continue
         if why := missing(method.library):
             rows[method.name] = replace(row, status="absent", why=why)
             continue
@@ -61,7 +65,7 @@ def measure(
         rows[name] = replace(
             rows[name],
             calls=sum(map(len, calls[name])),
-            metrics={m.key: m for m in [*judged.metrics, *metrics]},
+            metrics={m.key: m for m in [*judged.metrics, *method.metrics, *metrics]},
             samples={k: finite(v) for k, v in judged.samples.items()},
         )
     return list(rows.values())

@@ -64,7 +64,7 @@ class Row:
 
     Attributes:
         key: mode, workload, case and method.
-        library: the package that is measured.
+        library: the package that is measured, "published" for figures of a paper.
         status: "ok", "absent" (its library does not import) or "failed".
         why: of what is not "ok".
         parameters: of the method, written out.

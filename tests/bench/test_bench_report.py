@@ -31,6 +31,9 @@ def _write(folder: Path) -> str:
             _row("theirs", "gtsam", points, 24.68),
         ):
             records.append(path, records.to_line(row))
+        paper = _row("a paper's", "published", points, 0.0)
+        del paper.metrics["cpu_ms"]
+        records.append(path, records.to_line(paper))
         key = Key("full", "averaging_outliers", f"{points} % wrong", "third")
         records.append(
             path, records.to_line(Row(key, "kiss-matcher", "absent", "not installed"))
@@ -46,6 +49,7 @@ def test_report_is_written_from_records(tmp_path: Path):
     assert "made graphs; 7 trials, 14 calls of each method" in text
     assert "| **ours** | 95 | 12.3 [11.3, 13.3] | 0.50 |" in text
     assert "| theirs | 95 | 24.7 [23.7, 25.7] | 1.00 |" in text
+    assert "| a paper's | 95 |  | " in text
     assert "| third | absent: not installed |" in text
     assert "* ours: `of ours`" in text
     assert text.index("### 10 % wrong") < text.index("### 50 % wrong")

@@ -90,6 +90,22 @@ def test_a_peer_that_fails_is_a_row_and_the_others_go_on():
     assert "another version" in c.why
 
 
+def test_published_figures_are_a_row_and_not_called():
+    figures = [Metric("sum", 7.0, "", "up")]
+    paper = Method("the paper's", "published", "its own data", metrics=figures)
+    case = _case(_method("ours", lambda x: x), paper)
+    _, row = measure(case, list(case.methods), BLANK)
+    assert (row.status, row.library, row.calls) == ("ok", "published", 0)
+    assert row.metrics == {"sum": figures[0]}
+
+
+def test_what_is_known_of_a_method_stands_with_what_is_measured():
+    known = [Metric("look_ups", 3.0, "", "down")]
+    ours = Method("ours", "jaxreg", "", lambda x: x, metrics=known)
+    (row,) = measure(_case(ours), [ours], BLANK)
+    assert (row.value("sum"), row.value("look_ups")) == (10, 3)
+
+
 def test_methods_are_interleaved():
     order = []
     methods = [
