@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench import trial_plot
 from bench.records import Row
 from jaxreg.io.atomic import atomic_write
 from jaxreg.plot.figure import new_figure
@@ -50,6 +51,7 @@ SERIES = {
     "global_horse": Series(
         "e_rot", "rotation error of the found, degrees", False, True
     ),
+    "filter_paper": Series("t_mean", "mean error of translation, units", False, True),
     "look_ups": Series("success", "found, %", True, False),
     "neighbours": Series("cpu_ms", "CPU time of all queries, ms", True, True),
     "averaging_outliers": Series("success", "right, %", False, False),
@@ -71,6 +73,8 @@ def draw(workload: str, mode: str, rows: list[Row], out: Path) -> list[Path]:
         found.append(_success_by_overlap(rows, out / f"{head}_by_overlap.png"))
     if workload == "devices":
         found.append(_devices(rows, out / f"{head}.png"))
+    if workload == "filter_paper":
+        found += trial_plot.draw(rows, out, head)
     return [path for path in found if path is not None]
 
 

@@ -63,6 +63,19 @@ WORKLOADS = {
         "starts.",
         quick=False,
     ),
+    "filter_paper": Workload(
+        "The particle filter's paper",
+        "The PF paper's experiments. A part of a shape is displaced, and its pose as "
+        "given is the guess: the letter S of words, 50 of a cube's 400 points, the "
+        "front of a truck put at its rear. `look_ups` is how many closest points a "
+        "search looks up at most (pairs, for kernel correlation); `as_shape` counts "
+        "poses that look like the right one, too. Table 1 is the paper's, whose horse "
+        "was another: `t` is by how much the model's middle is put wrong, `theta` the "
+        "turn about z that is left, each with mean, deviation and largest size, "
+        "`e_rot` the median of the whole rotation; success within 10 degrees and 5 "
+        "units.",
+        quick=False,
+    ),
     "neighbours": Workload(
         "Closest points",
         "Targets on a sculpture; queries near its surface and after a turn of 10 "

@@ -14,13 +14,13 @@ import numpy as np
 
 from bench.averaging_scale import H, N, small_graph
 from bench.case import Case, Judged, Method, Options
-from bench.particle_data import horse, horse_model
-from bench.particle_horse import ours
-from bench.particle_run import look_ups
 from bench.records import Metric, share
+from bench.workloads.filter_data import horse, horse_model, horse_name
+from bench.workloads.filter_methods import look_ups
 from bench.workloads.global_horse import judge as judge_horse
 from bench.workloads.local_pairs import written_out
 from bench.workloads.neighbours import queries_off, sculpture_points
+from bench.workloads.prepared_model import ours
 from jaxreg import register
 from jaxreg.averaging import average
 from jaxreg.graph import PoseGraph
@@ -64,10 +64,13 @@ def _horses(options: Options) -> Case:
     text = f"{written_out(ours())}; {each} closest points a pair at most"
     method = Method("jaxreg register", "jaxreg", text, solve, on_accelerator=True)
     name = f"{HORSES} horses in one call, 25 % noise"
-    scanned = (folder / "horse.ply.gz").is_file()
-    data = "scanned horse" if scanned else "generated horse"
     return _case(
-        name, data, method, HORSES, "pairs", lambda x: judge_horse(trials, list(x[0]))
+        name,
+        horse_name(folder),
+        method,
+        HORSES,
+        "pairs",
+        lambda x: judge_horse(trials, list(x[0])),
     )
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bench.particle_data import Trials
+from bench.workloads.filter_data import Trials
 from jaxreg.io.stanford import read_conf
 
 

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from bench.case import Case, Judged, Method, Options, Solve
-from bench.particle_data import Trials, horse, horse_model
-from bench.particle_horse import ours, prepare, search, shift_of_model
-from bench.particle_run import outcome
 from bench.peers.global_pairs import GicpStarts, Peer, horse_peers
 from bench.records import error, share
+from bench.workloads.filter_data import Trials, horse, horse_model, horse_name
+from bench.workloads.filter_outcome import outcome, shift_of_model
 from bench.workloads.global_data import half, so3
 from bench.workloads.local_pairs import written_out
+from bench.workloads.prepared_model import ours, prepare, search
 from jaxreg import register
 from jaxreg.particle import AbstractSearch, ParticleFilter
 
@@ -50,7 +50,6 @@ def cases(options: Options) -> Iterator[Case]:
     """A case per protocol and share of noise."""
     folder = None if options.quick else options.data / "horse"
     model = horse_model(folder)
-    scanned = folder is not None and (folder / "horse.ply.gz").is_file()
     for name, draw, noises, method in PROTOCOLS:
         if options.quick and name != "half":
             continue
@@ -59,7 +58,7 @@ def cases(options: Options) -> Iterator[Case]:
             trials = draw(num, noise, model, SEED)
             yield Case(
                 name=f"{name}, {noise:.0%} noise",
-                data="scanned horse" if scanned else "generated horse",
+                data=horse_name(folder),
                 methods=methods(method(), trials, options.quick),
                 trials=[(points, k) for k, points in enumerate(trials.source)],
                 judge=partial(judge, trials),
@@ -99,7 +98,7 @@ def prepared(name: str, method: AbstractSearch, target: np.ndarray) -> Method:
 
         def solve(points: np.ndarray, seed: int) -> np.ndarray:
             key = jax.random.key(seed)
-            T, _ = search(method, model, jnp.asarray(points)[None], key)
+            T = search(method, model, jnp.asarray(points)[None], key)
             return np.asarray(T[0], float)
 
         return solve
@@ -134,7 +133,7 @@ def _from_identity(peer: GicpStarts, target: np.ndarray) -> Solve:
 def judge(trials: Trials, answers: list[Any]) -> Judged:
     """Success within the paper's bounds; errors of those that succeed."""
     T = np.array(answers)
-    found = outcome(T, np.zeros(len(T), int), trials)
+    found = outcome(T, trials)
     shift = shift_of_model(found, trials)
     right = (found.degrees <= trials.degrees) & (shift <= trials.shift)
     metrics = [share("success", right, 100 * max(1.0, 0.05 * len(T)) / len(T) + 1e-6)]

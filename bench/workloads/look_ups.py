@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from bench.case import Case, Judged, Method, Options, Solve
-from bench.particle_data import horse_model
 from bench.records import share
+from bench.workloads.filter_data import horse_model, horse_name
 from bench.workloads.global_data import SCAN_SETS, ScanPairs, half, scan_pairs, so3
 from bench.workloads.global_horse import PREPARED, judge, prepared
 from bench.workloads.local_pairs import written_out
@@ -46,7 +46,6 @@ def cases(options: Options) -> Iterator[Case]:
 def _horses(options: Options) -> Iterator[Case]:
     folder = options.data / "horse"
     model = horse_model(folder)
-    scanned = (folder / "horse.ply.gz").is_file()
     for title, draw, noise in (
         ("any rotation, 35 % noise", so3, 0.35),
         ("half, 25 % noise", half, 0.25),
@@ -59,7 +58,7 @@ def _horses(options: Options) -> Iterator[Case]:
             count = ours.most_look_ups * PREPARED.num_points
             yield Case(
                 name=f"{title}, {count / 1e6:.3f} M",
-                data="scanned horse" if scanned else "generated horse",
+                data=horse_name(folder),
                 methods=[prepared(n, s, trials.target) for n, s in found.items()],
                 trials=[(points, k) for k, points in enumerate(trials.source)],
                 judge=partial(judge, trials),

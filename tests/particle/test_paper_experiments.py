@@ -1,7 +1,7 @@
 """The outcome of the PF paper's experiments (section 5) on small generated data.
 
 The searches alone, without refinement and scores; rates over many seeds are those of
-`python -m bench.particle_paper`.
+`python -m bench --only filter_paper`.
 """
 
 import equinox as eqx
@@ -13,9 +13,16 @@ from helpers import data_dir
 from jax import lax
 from jaxtyping import Array
 
-from bench.particle_data import Trials, cube, horse, horse_model, letter, truck
-from bench.particle_horse import ours, shift_of_model
-from bench.particle_run import Outcome, outcome
+from bench.workloads.filter_data import (
+    Trials,
+    cube,
+    horse,
+    horse_model,
+    letter,
+    truck,
+)
+from bench.workloads.filter_outcome import Outcome, outcome, shift_of_model
+from bench.workloads.prepared_model import ours
 from jaxreg._core.arrays import cast_floats
 from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.correlation.ascent import ascend
@@ -111,7 +118,7 @@ class _Correlation(eqx.Module):
 
 def _run(find: eqx.Module, trials: Trials) -> Outcome:
     T = _poses(find, jnp.asarray(trials.source), jnp.asarray(trials.target))
-    return outcome(np.asarray(T, float), np.zeros(len(T), int), trials)
+    return outcome(np.asarray(T, float), trials)
 
 
 def _paper_in_space(prior: GaussianPrior, which: int = 2) -> _Least:

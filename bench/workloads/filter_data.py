@@ -115,6 +115,10 @@ def truck(num: int, seed: int = 0) -> Trials:
     return _trials(points, motions, target - middle, 10.0, 0.3)
 
 
+#: What the paper shows one run of, by the number of trials.
+EXPERIMENTS = {"letter": letter, "cube": cube, "truck": truck}
+
+
 def horse(num: int, noise: float, model: np.ndarray, seed: int = 0) -> Trials:
     """Table 1: 400 points of a model, moved, some replaced by noise.
 
@@ -147,12 +151,23 @@ def horse_model(folder: Path | None) -> np.ndarray:
     The scanned horse of the folder, scaled to the paper's diagonal, else, where there
     is no such folder, one made of our own.
     """
-    if folder is None or not (folder / "horse.ply.gz").is_file():
+    scan = _scan(folder)
+    if scan is None:
         return horse_like_points(8000)
-    points = read_points(folder / "horse.ply.gz").astype(float)
+    points = read_points(scan).astype(float)
     low, high = points.min(axis=0), points.max(axis=0)
     points = (points - (low + high) / 2) * _HORSE_DIAGONAL / np.linalg.norm(high - low)
     return points[np.random.default_rng(0).permutation(len(points))[:8000]]
+
+
+def horse_name(folder: Path | None) -> str:
+    """What `horse_model` takes, as told to the reader."""
+    return "generated horse" if _scan(folder) is None else "scanned horse"
+
+
+def _scan(folder: Path | None) -> Path | None:
+    path = None if folder is None else folder / "horse.ply.gz"
+    return path if path is not None and path.is_file() else None
 
 
 def moved(T: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The picture of an experiment: one trial before and after each of a few methods."""
+"""Pictures of experiments: one trial before and after each method."""
 
 import io
 import textwrap
@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.particle_data import moved
+from bench.records import Row
+from bench.workloads.filter_data import EXPERIMENTS, moved
 from jaxreg.io.atomic import atomic_write
 from jaxreg.plot.figure import new_figure, tilt
 
@@ -20,6 +21,35 @@ class Panel(NamedTuple):
 
     title: str
     T_target_source: np.ndarray
+
+
+def draw(rows: list[Row], out: Path, head: str) -> list[Path]:
+    """Draws the first trial of each experiment; the files.
+
+    Trials are drawn anew, as `samples` have the poses alone. Of kernel correlation, the
+    bandwidth that finds most.
+    """
+    paths = []
+    for name, trials_of in EXPERIMENTS.items():
+        here = [r for r in rows if r.key.case == name and "found" in r.samples]
+        rivals = [r for r in here if r.key.method.startswith("kernel correlation")]
+        best = max(rivals, key=lambda r: r.value("success") or 0, default=None)
+        shown = [r for r in here if r not in rivals or r is best]
+        if not shown:
+            continue
+        trials = trials_of(shown[0].trials)
+        paths.append(out / f"{head}_{name}.png")
+        panels = [Panel("as given", np.eye(trials.target.shape[1] + 1))]
+        panels += [_panel(row) for row in shown]
+        trial_figure(paths[-1], trials.source[0], trials.target, panels)
+    return paths
+
+
+def _panel(row: Row) -> Panel:
+    T = np.array(row.samples["T_target_source"])
+    verdict = "found" if row.samples["found"][0] else "missed"
+    title = f"{row.key.method}: {verdict} ({row.value('success'):.0f} % of all)"
+    return Panel(title, T.reshape(2 * [round(len(T) ** 0.5)]))
 
 
 def trial_figure(
