@@ -1,7 +1,6 @@
 """Pictures of experiments: one trial before and after each method."""
 
 import io
-import textwrap
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,8 +46,11 @@ def draw(rows: list[Row], out: Path, head: str) -> list[Path]:
 
 def _panel(row: Row) -> Panel:
     T = np.array(row.samples["T_target_source"])
-    verdict = "found" if row.samples["found"][0] else "missed"
-    title = f"{row.key.method}: {verdict} ({row.value('success'):.0f} % of all)"
+    found, alike = (row.samples[key][0] for key in ("found", "as_shape"))
+    verdict = "found" if found else "looks the same" if alike else "missed"
+    title = (
+        f"{row.key.method}\n{verdict}; found in {row.value('success'):.0f} % of trials"
+    )
     return Panel(title, T.reshape(2 * [round(len(T) ** 0.5)]))
 
 
@@ -56,27 +58,28 @@ def trial_figure(
     path: Path, source: np.ndarray, target: np.ndarray, panels: list[Panel]
 ) -> None:
     """Draws a PNG: the target gray, the source red, all panels on one scale."""
-    flat = target.shape[1] == 2
-    columns = 2 if flat else min(4, len(panels))
-    rows = -(-len(panels) // columns)
-    size = (11, 2.3 * rows) if flat else (3.2 * columns, 3.4 * rows)
-    figure = new_figure(figsize=size, dpi=130)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
     before = _seen(target)
     drawn = [_seen(moved(p.T_target_source, source.astype(float))) for p in panels]
     low = np.min([x.min(axis=0) for x in (before, *drawn)], axis=0)
     high = np.max([x.max(axis=0) for x in (before, *drawn)], axis=0)
     margin = 0.04 * (high - low).max()
+    low, high = low - margin, high + margin
+    flat = target.shape[1] == 2
+    columns = 2 if flat else -(-len(panels) // 2)
+    rows = -(-len(panels) // columns)
+    width = 5.5 if flat else 3.0
+    height = width * (high[1] - low[1]) / (high[0] - low[0]) + 0.6  # for the title
+    figure = new_figure(figsize=(columns * width, rows * height), dpi=110)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes:
         axis.set_axis_off()
     for axis, panel, here in zip(axes, panels, drawn, strict=False):
         dot = 3.0 if flat else 9.0 if len(target) < 1000 else 2.5
         axis.scatter(*before.T, s=dot, color=_TARGET, linewidths=0)
         axis.scatter(*here.T, s=1.6 * dot, color=_SOURCE, linewidths=0)
-        title = textwrap.fill(panel.title, 64 if flat else 36)
-        axis.set_title(title, fontsize=9)
-        axis.set_xlim(low[0] - margin, high[0] + margin)
-        axis.set_ylim(low[1] - margin, high[1] + margin)
+        axis.set_title(panel.title, fontsize=9)
+        axis.set_xlim(low[0], high[0])
+        axis.set_ylim(low[1], high[1])
         axis.set_aspect("equal")
     figure.tight_layout(pad=0.6)
     buffer = io.BytesIO()

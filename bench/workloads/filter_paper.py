@@ -48,8 +48,8 @@ def cases(options: Options) -> Iterator[Case]:
         n, m = trials.source.shape[1], len(trials.target)
         yield Case(
             name=name,
-            data=f"generated, {n} points on {m}; found: within {trials.degrees:g} "
-            f"degrees and {trials.shift:g} units",
+            data=f"generated, {n} points on {m}, found within {trials.degrees:g} "
+            f"degrees and a shift of {trials.shift:g}",
             methods=[_method(tried, trials) for tried in METHODS[name]],
             trials=_arguments(trials),
             judge=partial(judge, trials),
@@ -132,9 +132,12 @@ def judge(trials: Trials, answers: list[Any]) -> Judged:
         error("e_rot", float(np.median(found.degrees)), "deg", 0.05),
         error("e_trans", float(np.median(found.shift)), "units", 0.05),
     ]
-    first = found.T_target_source[0].ravel().tolist()
-    seen = {"T_target_source": first, "found": [float(found.success[0])]}
-    return Judged(metrics, seen)
+    first = {
+        "T_target_source": found.T_target_source[0].ravel().tolist(),
+        "found": [float(found.success[0])],
+        "as_shape": [float(found.aligned[0])],
+    }
+    return Judged(metrics, first)
 
 
 def judge_table(trials: Trials, answers: list[Any]) -> Judged:

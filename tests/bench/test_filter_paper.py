@@ -71,8 +71,8 @@ def test_pictures_show_the_first_trial_of_the_rows(
     np.testing.assert_array_equal(source, trials.source[0])
     assert [panel.title for panel in panels] == [
         "as given",
-        "a filter: found (97 % of all)",
-        "kernel correlation, 2: found (3 % of all)",
+        "a filter\nfound; found in 97 % of trials",
+        "kernel correlation, 2\nfound; found in 3 % of trials",
     ]
     for panel in panels[1:]:
         np.testing.assert_allclose(
