@@ -31,8 +31,8 @@ class Method:
         solve: called on every trial.
         prepare: where something is built once for all trials, what returns `solve`;
             its time is a metric of its own.
-        in_processes: whether `solve` works in other processes, whose CPU time is not
-            that of this one.
+        in_processes: whether `solve` works in other processes, whose CPU time and
+            memory are not those of this one.
         on_accelerator: whether `solve` is JAX on arrays of its own and gets a second
             row where there is an accelerator.
         metrics: what is known of it without a call.

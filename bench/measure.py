@@ -58,9 +58,10 @@ def measure(
         metrics = _times(case, method, first[name], calls[name])
         if name in prepared:
             metrics.append(Metric("prepare_ms", 1e3 * prepared[name], "ms", "down"))
-        before(name)
-        memory = growth_mib(lambda name=name: solves[name](*case.trials[0]))
-        metrics.append(Metric("memory_mib", memory, "MiB", "down"))
+        if not method.in_processes:
+            before(name)
+            memory = growth_mib(lambda name=name: solves[name](*case.trials[0]))
+            metrics.append(Metric("memory_mib", memory, "MiB", "down"))
         judged = case.judge([of_trial[-1].value for of_trial in calls[name]])
         rows[name] = replace(
             rows[name],

@@ -32,16 +32,15 @@ How it is measured. Every workload runs in a process of its own, pinned to the n
 cores that its tables state; OpenMP, BLAS and XLA have as many threads. Methods of a
 table are called in turn, in an order that changes, on the same inputs. CPU time is that
 of all threads of a call, the median over all calls (five or more, or three that take
-minutes) with its
-quartiles in brackets. `first call` is wall time of the first call, with compilation for
-JAX (no compilation cache); `prepare` what is built once for all trials, compiled
-before. Where wall time is far above CPU time, the machine had other work. `memory` is
-how far one call lifts the resident set. `x` is CPU time over that of the table's
-reference in the same run (wall time where work is in other processes). `data` and
-parameters are written out; lengths that end in "of extent" are shares of the diagonal
-of the bounding box. A peer that is not installed or fails has a row that says so. Rows
-of `--quick` are for the gate: generated data, as many workloads at a time as there are
-cores.
+minutes) with its quartiles in brackets. `first call` is wall time of the first call,
+with compilation for JAX (no compilation cache); `prepare` what is built once for all
+trials, compiled before. Where wall time is far above CPU time, the machine had other
+work. `memory` is how far one call lifts the resident set. Of work in other processes
+there is wall time alone. `x` is CPU time over that of the table's reference in the same
+run (wall time where work is in other processes). `data` and parameters are written out;
+lengths that end in "of extent" are shares of the diagonal of the bounding box. A peer
+that is not installed or fails has a row that says so. Rows of `--quick` are for the
+gate: generated data, as many workloads at a time as there are cores.
 """
 
 
@@ -142,7 +141,7 @@ def _table(case: str, rows: list[Row]) -> Iterator[str]:
         if row.status != "ok":
             yield f"| {name} | {row.status}: {_plain(row.why)} |"
             continue
-        cells = [_cell(row.metrics.get(k)) for k in accuracy + costs]
+        cells = [_cell(row.metrics.get(k), k == costs[0]) for k in accuracy + costs]
         if reference:
             cells.append(_ratio(row, rows, reference))
         yield f"| {name} | {' | '.join(cells)} |"
@@ -154,11 +153,11 @@ def _plain(text: str) -> str:
     return " ".join(text.split()).replace("|", "/")[:160]
 
 
-def _cell(metric: Metric | None) -> str:
+def _cell(metric: Metric | None, with_spread: bool) -> str:
     if metric is None:
         return ""
     text = number(metric.value)
-    if metric.key in ("cpu_ms",) and metric.spread:
+    if with_spread and metric.spread:
         text += f" [{number(metric.spread[0])}, {number(metric.spread[1])}]"
     return text
 
