@@ -1,16 +1,20 @@
 """Runs workloads, each in a process of its own, and keeps rows as they finish."""
 
+import contextlib
 import hashlib
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
+import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from queue import Queue
+from threading import Event
 from typing import Any, NamedTuple
 
 from bench import records
@@ -59,7 +63,7 @@ def run(settings: Settings) -> records.Records:
     Returns:
         All rows of the file, with those of earlier calls.
     """
-    name = _begin(settings)
+    name, stop = _begin(settings), Event()
     free = sorted(os.sched_getaffinity(0))
     asked = [w for w in settings.workloads if WORKLOADS[w].quick or not settings.quick]
     for workload in settings.workloads:
@@ -67,10 +71,8 @@ def run(settings: Settings) -> records.Records:
             print(f"{workload}: not in --quick")
     if not settings.quick:
         for workload in asked:
-            known = WORKLOADS[workload]
-            _measure(
-                settings, workload, name, free[:1] if known.cores == "one" else free
-            )
+            cores = free[:1] if WORKLOADS[workload].cores == "one" else free
+            _measure(settings, workload, name, cores, stop)
         return records.read(settings.path)
     # As many at a time as there are cores: what is compared shares one process and
     # one core, so all of it is disturbed alike.
@@ -81,14 +83,18 @@ def run(settings: Settings) -> records.Records:
     def one(workload: str) -> None:
         core = idle.get()
         try:
-            _measure(settings, workload, name, [core])
+            _measure(settings, workload, name, [core], stop)
         finally:
             idle.put(core)
 
-    with ThreadPoolExecutor(len(free)) as pool:
+    pool = ThreadPoolExecutor(len(free))
+    try:
         # The longest are the last of the list.
         for done in [pool.submit(one, workload) for workload in reversed(asked)]:
             done.result()
+    finally:
+        stop.set()
+        pool.shutdown(cancel_futures=True)
     return records.read(settings.path)
 
 
@@ -124,58 +130,76 @@ def _memory_gib() -> float:
 
 
 def _measure(
-    settings: Settings, workload: str, run_name: str, cores: list[int]
+    settings: Settings, workload: str, run_name: str, cores: list[int], stop: Event
 ) -> None:
     """Starts the process; once more without what crashed it, until it ends well."""
+    known = WORKLOADS[workload]
+    print(f"{workload}: {known.title} ...", flush=True)
     started = time.perf_counter()
-    task = {
-        "workload": workload,
-        "quick": settings.quick,
-        "peers": settings.peers,
-        "out": str(settings.out),
-        "data": str(settings.data),
-        "resume": settings.resume,
-        "run": run_name,
-        "cores": cores,
-    }
     environment = os.environ | dict.fromkeys(_THREADS, str(len(cores)))
-    environment["JAX_ENABLE_X64"] = "1" if WORKLOADS[workload].double else "0"
+    environment["JAX_ENABLE_X64"] = "1" if known.double else "0"
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)  # first calls compile
-    command = [sys.executable, "-m", "bench.worker", json.dumps(task)]
     crashed: set[tuple[str, str]] = set()
-    running = settings.out / f"running-{workload}.json"
-    while why := _process(command, environment, running, settings.longest_call):
-        state = _state(running)
-        at = (state["case"], state["method"])
-        if at in crashed:  # it is not the method
-            break
-        crashed.add(at)
-        key = Key(settings.mode, workload, *at)
-        row = Row(key, state["library"], "failed", why, run=run_name)
-        records.append(settings.path, records.to_line(row))
-        print(f"{workload}: {at[0]}: {at[1]}: {why}", flush=True)
+    # A process that is killed leaves its temporary files; ours go with the folder.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        environment["TMPDIR"] = scratch
+        running = Path(scratch, "running.json")
+        task = {
+            "workload": workload,
+            "quick": settings.quick,
+            "peers": settings.peers,
+            "out": str(settings.out),
+            "data": str(settings.data),
+            "resume": settings.resume,
+            "run": run_name,
+            "cores": cores,
+            "running": str(running),
+        }
+        command = [sys.executable, "-m", "bench.worker", json.dumps(task)]
+        longest = settings.longest_call
+        while why := _process(command, environment, running, longest, stop):
+            state = _state(running)
+            at = (state["case"], state["method"])
+            if at in crashed:  # it is not the method
+                break
+            crashed.add(at)
+            key = Key(settings.mode, workload, *at)
+            row = Row(key, state["library"], "failed", why, run=run_name)
+            records.append(settings.path, records.to_line(row))
+            print(f"{workload}: {at[0]}: {at[1]}: {why}", flush=True)
     print(f"{workload}: {time.perf_counter() - started:.0f} s", flush=True)
 
 
 def _process(
-    command: list[str], environment: dict, running: Path, longest_call: float
+    command: list[str],
+    environment: dict,
+    running: Path,
+    longest_call: float,
+    stop: Event,
 ) -> str:
-    """Why the process of a workload did not end well, or ''."""
+    """Why the process of a workload did not end well, or ''.
+
+    Raises:
+        KeyboardInterrupt: if told to stop.
+    """
     running.unlink(missing_ok=True)
-    with subprocess.Popen(command, env=environment) as process:
-        try:
-            while True:
-                try:
-                    code = process.wait(1)
-                    break
-                except subprocess.TimeoutExpired:
-                    if _age(running) > longest_call:
-                        process.kill()
-                        return f"no answer in {longest_call:.0f} s"
-        except BaseException:
-            process.kill()
-            raise
-    return "" if code == 0 else f"its process ended with code {code}"
+    # A group of its own: Ctrl-C comes here alone, and its children end with it.
+    process = subprocess.Popen(
+        command, env=environment, stdin=subprocess.DEVNULL, process_group=0
+    )
+    try:
+        while not stop.is_set():
+            try:
+                code = process.wait(1)
+                return "" if code == 0 else f"its process ended with code {code}"
+            except subprocess.TimeoutExpired:
+                if _age(running) > longest_call:
+                    return f"no answer in {longest_call:.0f} s"
+        raise KeyboardInterrupt
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 def _age(path: Path) -> float:

@@ -24,8 +24,7 @@ def main(task: dict[str, Any]) -> None:
     os.sched_setaffinity(0, task["cores"])
     # Imported after that: threads are started when libraries load.
     module = importlib.import_module(f"bench.workloads.{task['workload']}")
-    out = Path(task["out"])
-    path, running = out / "rows.jsonl", out / f"running-{task['workload']}.json"
+    path, running = Path(task["out"]) / "rows.jsonl", Path(task["running"])
     done = records.read(path).rows if path.exists() else {}
     if not task["resume"]:
         done = {k: r for k, r in done.items() if r.run == task["run"]}

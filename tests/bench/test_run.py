@@ -1,7 +1,10 @@
 """What is measured, kept, and said of what is absent, fails or is interrupted."""
 
 import os
+import signal
 import sys
+import threading
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -106,6 +109,17 @@ def test_what_is_known_of_a_method_stands_with_what_is_measured():
     assert (row.value("sum"), row.value("look_ups")) == (10, 3)
 
 
+def test_work_in_other_processes_has_wall_time_alone_and_no_call_for_memory():
+    calls = []
+    inside = _method("inside", lambda x: x)
+    outside = Method("outside", "jaxreg", "", lambda x: calls.append(x) or x,
+                     in_processes=True)  # fmt: skip
+    rows = measure(_case(inside, outside), [inside, outside], BLANK)
+    inner, outer = (set(row.metrics) for row in rows)
+    assert inner - outer == {"cpu_ms", "memory_mib"}
+    assert len(calls) == 6  # the first, then one of each trial
+
+
 def test_methods_are_interleaved():
     order = []
     methods = [
@@ -162,6 +176,7 @@ def fake(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, absent: str):
         "resume": False,
         "run": "first",
         "cores": [0],
+        "running": str(tmp_path / "running.json"),
     }
     return state, task, tmp_path / "rows.jsonl"
 
@@ -222,13 +237,45 @@ def test_a_workload_without_its_data_says_so(fake, monkeypatch, capsys):
 
 def test_a_process_that_dies_or_hangs_is_told(tmp_path: Path):
     running = tmp_path / "running.json"
-    dies = [sys.executable, "-c", "import os; os._exit(3)"]
-    assert "code 3" in run._process(dies, dict(os.environ), running, 60)
+
+    def why(code: str, longest: float) -> str:
+        command = [sys.executable, "-c", code]
+        return run._process(
+            command, dict(os.environ), running, longest, threading.Event()
+        )
+
+    assert "code 3" in why("import os; os._exit(3)", 60)
     write = f"import pathlib, time; pathlib.Path({str(running)!r}).touch(); "
-    hangs = [sys.executable, "-c", write + "time.sleep(60)"]
-    assert "no answer" in run._process(hangs, dict(os.environ), running, 0.5)
-    well = [sys.executable, "-c", ""]
-    assert run._process(well, dict(os.environ), running, 60) == ""
+    assert "no answer" in why(write + "time.sleep(60)", 0.5)
+    assert why("", 60) == ""
+
+
+def test_an_interruption_ends_all_processes_and_leaves_no_row(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Of two workloads at a time, each with a process of its own beneath it."""
+    beat = f"while true; do date +%s%N > {tmp_path}/beat; sleep 0.05; done"
+    script = tmp_path / "worker"
+    script.write_text(f"#!/bin/sh\nsh -c '{beat}' &\nwait\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script))
+    settings = run.Settings(
+        ["neighbours", "gradients"], True, None, tmp_path, tmp_path, False
+    )
+    beating, main = tmp_path / "beat", threading.get_ident()
+
+    def interrupt() -> None:
+        while not beating.exists():
+            time.sleep(0.05)
+        signal.pthread_kill(main, signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        run.run(settings)
+    last = beating.read_text()
+    time.sleep(0.3)
+    assert beating.read_text() == last
+    assert not records.read(settings.path).rows
 
 
 def test_a_method_that_kills_its_process_is_a_row(
@@ -236,7 +283,7 @@ def test_a_method_that_kills_its_process_is_a_row(
 ):
     ends = iter(["its process ended with code -11", ""])
 
-    def process(command, environment, running: Path, longest: float) -> str:
+    def process(command, environment, running: Path, longest, stop) -> str:
         running.write_text('{"case": "two", "method": "theirs", "library": "open3d"}')
         return next(ends)
 
@@ -254,9 +301,18 @@ def test_every_workload_is_a_module_and_every_peer_a_name():
     assert missing("scipy") is None
 
 
-def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]):
-    for words in (["--only", "nothing"], ["--peers", "scipy,nobody"]):
-        with pytest.raises(SystemExit):
+def test_what_cannot_be_used_is_named_and_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    (tmp_path / "file").touch()
+    for words, named in (
+        (["--only", "nothing"], "nothing"),
+        (["--peers", "scipy,nobody"], "nobody"),
+        (["--data", str(tmp_path / "absent")], "absent"),
+        (["--out", str(tmp_path / "file")], "file"),
+    ):
+        with pytest.raises(SystemExit) as refused:
             parse(words)
-        assert "nothing" in (err := capsys.readouterr().err) or "nobody" in err
+        assert refused.value.code == 2
+        assert named in capsys.readouterr().err
     assert parse(["--peers", "none"]).peers == []
