@@ -1,26 +1,24 @@
 """Measures jaxreg beside its peers: accuracy, time and memory, row by row.
 
-Run: python -m bench [--quick] [--only NAME ...] [--peers LIST] [--out DIR] [--data DIR]
-     [--resume] [--gate]
-
 Writes OUT/rows.jsonl while it runs, and OUT/REPORT.md with plots in the end. Peers come
 with `pip install '.[bench]'` (probreg, which builds from source and needs six and
-scikit-learn, by hand); one that is missing has a row that says so. --quick is a
-selection on generated data, in about two minutes. --resume goes on where an earlier
-call with the same DIR was interrupted. --gate compares with bench/baseline.jsonl and
-ends with code 1 where accuracy, or time beside a peer of the same run, was lost.
+scikit-learn, by hand); one that is missing has a row that says so. An interrupted call
+goes on with --resume.
 """
 
 import argparse
 import os
 import signal
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from bench import gate, records, report
 from bench.peers import PEERS
 from bench.run import Settings, run
 from bench.workloads import WORKLOADS
+from jaxreg.io.atomic import require_writable
+from jaxreg.io.errors import InputError
 
 
 BASELINE = Path(__file__).parent / "baseline.jsonl"
@@ -33,22 +31,32 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        choices=WORKLOADS,
-        metavar="NAME",
-        help=", ".join(WORKLOADS),
+    add = parser.add_argument
+    add("--quick", action="store_true", help="generated data only, some minutes")
+    known = ", ".join(WORKLOADS)
+    add("--only", nargs="+", choices=WORKLOADS, metavar="NAME", help=f"of {known}")
+    known = ", ".join(PEERS)
+    add("--peers", metavar="LIST", help=f"with commas, of {known}; 'none' for none")
+    add(
+        "--out",
+        type=Path,
+        default=Path("bench-out"),
+        metavar="DIR",
+        help="for rows and report (default: ./bench-out)",
     )
-    parser.add_argument(
-        "--peers", metavar="LIST", help=f"of {','.join(PEERS)}; 'none' for none"
+    add(
+        "--data",
+        type=Path,
+        metavar="DIR",
+        help="real scans and graphs (default: JAXREG_DATA, else ../shared/data)",
     )
-    parser.add_argument("--out", type=Path, default=Path("bench-out"), metavar="DIR")
-    data = os.environ.get("JAXREG_DATA", "../shared/data")
-    parser.add_argument("--data", type=Path, default=Path(data), metavar="DIR")
-    parser.add_argument("--resume", action="store_true")
-    parser.add_argument("--gate", action="store_true")
+    add("--resume", action="store_true", help="go on with what --out holds")
+    add(
+        "--gate",
+        action="store_true",
+        help="compare with bench/baseline.jsonl; exit code 1 where accuracy, or time "
+        "beside a peer of the same run, was lost",
+    )
     options = parser.parse_args(arguments)
     if options.peers is not None:
         names = [] if options.peers == "none" else options.peers.split(",")
@@ -57,6 +65,16 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
                 f"--peers: no {', '.join(unknown)}; there are {', '.join(PEERS)}"
             )
         options.peers = names
+    if options.data is None:
+        options.data = Path(os.environ.get("JAXREG_DATA", "../shared/data"))
+    elif not options.data.is_dir():
+        parser.error(f"--data {options.data}: no such folder")
+    if find_spec("matplotlib") is None:
+        parser.error("plots need matplotlib: pip install '.[bench]'")
+    try:
+        require_writable(options.out)
+    except InputError as err:
+        parser.error(str(err))
     return options
 
 
@@ -69,7 +87,9 @@ def main(arguments: list[str] | None = None) -> int:
     )
     if not options.quick and not options.data.is_dir():
         print(f"no data in {options.data}: workloads on generated data only")
-    signal.signal(signal.SIGTERM, _interrupt)
+    for name in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(name) == signal.SIG_DFL:
+            signal.signal(name, _interrupt)
     try:
         found = run(settings)
     except KeyboardInterrupt:

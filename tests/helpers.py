@@ -6,12 +6,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 
 def data_dir(*parts: str) -> Path:
     """A folder or file of the real data; skips the test where it is absent."""
+    import pytest  # not where the comparison with other libraries draws from here
+
     root = Path(
         os.environ.get(
             "JAXREG_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"
