@@ -129,6 +129,17 @@ WORKLOADS = {
         "registrations were spent.",
         quick=False,
     ),
+    "command_line": Workload(
+        "What a person waits for at the terminal",
+        "Commands as processes of their own, from an empty folder to written files, "
+        "pictures and page: with an empty cache folder, so that they compile, and with "
+        "that of an earlier call. `compile` and `run` are parts of that time as the "
+        "command reports them. `before` and `after` are SE-Sync's objective of the "
+        "spanning tree and of the answer.",
+        cores="all",
+        double=True,
+        quick=False,
+    ),
     "gradients": Workload(
         "Gradients",
         "Gradients of a sum over the answer beside the answer itself, float64, and how "
