@@ -9,6 +9,7 @@ import numpy as np
 
 from bench import trial_plot
 from bench.records import Row
+from bench.trajectories import trajectories
 from jaxreg.io.atomic import atomic_write
 from jaxreg.plot.figure import new_figure
 
@@ -71,6 +72,8 @@ def draw(workload: str, mode: str, rows: list[Row], out: Path) -> list[Path]:
         found.append(_success_by_error(rows, out / f"{head}_by_error.png"))
     if workload == "global_scans":
         found.append(_success_by_overlap(rows, out / f"{head}_by_overlap.png"))
+    if workload == "false_closures":
+        found.append(trajectories(rows, out / f"{head}.png"))
     if workload == "devices":
         found.append(_devices(rows, out / f"{head}.png"))
     if workload == "filter_paper":

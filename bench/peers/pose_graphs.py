@@ -4,9 +4,9 @@ Graphs of files are read by GTSAM itself, before the time is taken.
 """
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -15,6 +15,13 @@ from scipy.sparse.csgraph import breadth_first_order
 
 #: Deviations that it is told for motions without information: degrees, length.
 SIGMAS = (2.0, 0.05)
+
+
+class Found(NamedTuple):
+    """Poses, and where the method tells, from 0 to 1 how far it trusts each motion."""
+
+    T_world_i: np.ndarray  # (v, d+1, d+1)
+    weight: np.ndarray | None
 
 
 def g2o_solver(path: Path, dim: int) -> Callable[[], np.ndarray]:
@@ -49,7 +56,7 @@ def large_lm(
     """The same for motions `(e, 4, 4)` with deviations in radians and lengths."""
     lib: Any = importlib.import_module("gtsam")
     noise = lib.noiseModel.Diagonal.Sigmas(np.repeat([turn, shift], 3))
-    factors = between(lib, edges, T_i_j, noise)
+    factors = between(lib, edges, T_i_j, [noise] * len(edges))
 
     def solve() -> np.ndarray:
         begin = lib.InitializePose3.initialize(factors)
@@ -59,14 +66,26 @@ def large_lm(
     return solve
 
 
-def between(lib: Any, edges: np.ndarray, T_i_j: np.ndarray, noise: Any) -> Any:
-    """A graph of motions in space with the first pose held."""
+def between(
+    lib: Any, edges: np.ndarray, T_i_j: np.ndarray, noises: Sequence[Any]
+) -> Any:
+    """A graph of motions in space or in the plane with the first pose held."""
+    dim = T_i_j.shape[-1] - 1
+    prior = lib.PriorFactorPose3 if dim == 3 else lib.PriorFactorPose2
+    factor = lib.BetweenFactorPose3 if dim == 3 else lib.BetweenFactorPose2
     factors = lib.NonlinearFactorGraph()
-    held = lib.noiseModel.Diagonal.Sigmas(np.full(6, 1e-4))
-    factors.add(lib.PriorFactorPose3(0, lib.Pose3(), held))
-    for (i, j), T in zip(edges.tolist(), T_i_j, strict=True):
-        factors.add(lib.BetweenFactorPose3(i, j, lib.Pose3(T), noise))
+    held = lib.noiseModel.Diagonal.Sigmas(np.full(6 if dim == 3 else 3, 1e-4))
+    factors.add(prior(0, pose(lib, np.eye(dim + 1)), held))
+    for (i, j), T, noise in zip(edges.tolist(), T_i_j, noises, strict=True):
+        factors.add(factor(i, j, pose(lib, T), noise))
     return factors
+
+
+def pose(lib: Any, T: np.ndarray) -> Any:
+    """Of GTSAM, in space or in the plane."""
+    if len(T) == 4:
+        return lib.Pose3(T)
+    return lib.Pose2(T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0]))
 
 
 def tree_poses(edges: np.ndarray, T_i_j: np.ndarray, num: int) -> np.ndarray:
@@ -75,7 +94,7 @@ def tree_poses(edges: np.ndarray, T_i_j: np.ndarray, num: int) -> np.ndarray:
     first = coo_array((rows, (edges[:, 0], edges[:, 1])), (num, num)).tocsr()
     order, parent = breadth_first_order(first, 0, directed=False)
     row = {(i, j): k for k, (i, j) in enumerate(edges.tolist())}
-    T = np.tile(np.eye(4), (num, 1, 1))
+    T = np.tile(np.eye(T_i_j.shape[-1]), (num, 1, 1))
     for v in order[1:].tolist():
         p = int(parent[v])
         if (p, v) in row:
@@ -86,34 +105,69 @@ def tree_poses(edges: np.ndarray, T_i_j: np.ndarray, num: int) -> np.ndarray:
 
 
 def robust(
-    edges: np.ndarray, T_i_j: np.ndarray, num: int, *, kernel: str
-) -> np.ndarray:
-    """Poses `(num, 4, 4)` by graduated non-convexity or by robust kernels.
+    edges: np.ndarray,
+    T_i_j: np.ndarray,
+    num: int,
+    *,
+    kernel: str,
+    information: np.ndarray | None = None,
+    T_start: np.ndarray | None = None,
+    right: Sequence[int] = (),
+) -> Found:
+    """By graduated non-convexity or by robust kernels.
 
     Args:
         edges: `(e, 2)`.
-        T_i_j: `(e, 4, 4)`.
+        T_i_j: `(e, d+1, d+1)`.
         num: of poses.
-        kernel: "GNC" (Geman-McClure, on all edges) or "Huber" (then Geman-McClure).
+        kernel: "GNC" (Geman-McClure, on all edges), "GNC TLS" (its truncated least
+            squares), "Huber" (then Geman-McClure) or "Geman-McClure".
+        information: `(e, k, k)`, translation first, else of `SIGMAS`.
+        T_start: `(v, d+1, d+1)`, else along a breadth-first tree.
+        right: edges that GNC is told to be right.
     """
     lib: Any = importlib.import_module("gtsam")
-    degrees, length = SIGMAS
-    sigmas = np.array([np.deg2rad(degrees)] * 3 + [length] * 3)
-    plain = lib.noiseModel.Diagonal.Sigmas(sigmas)
-    values = lib.Values()
     T_i_j = T_i_j.astype(np.float64)
-    for v, T in enumerate(tree_poses(edges, T_i_j, num)):
-        values.insert(v, lib.Pose3(T))
-    if kernel == "GNC":
-        params = lib.GncLMParams()
-        params.setLossType(lib.GncLossType.GM)
-        params.setKnownInliers([0])  # the prior
-        factors = between(lib, edges, T_i_j, plain)
-        values = lib.GncLMOptimizer(factors, values, params).optimize()
+    T_start = tree_poses(edges, T_i_j, num) if T_start is None else T_start
+    values = lib.Values()
+    for v, T in enumerate(T_start):
+        values.insert(v, pose(lib, T))
+    noises = _noises(lib, len(edges), information)
+    if kernel.startswith("GNC"):
+        factors = between(lib, edges, T_i_j, noises)
+        values, weight = _gnc(lib, factors, values, kernel, right)
     else:
-        estimators = lib.noiseModel.mEstimator
-        for shape in (estimators.Huber, estimators.GemanMcClure):
-            noise = lib.noiseModel.Robust.Create(shape.Create(1.345), plain)
-            factors = between(lib, edges, T_i_j, noise)
+        weight, models = None, lib.noiseModel
+        last = [models.mEstimator.GemanMcClure]
+        for shape in [models.mEstimator.Huber] * (kernel == "Huber") + last:
+            wrapped = [models.Robust.Create(shape.Create(1.345), n) for n in noises]
+            factors = between(lib, edges, T_i_j, wrapped)
             values = lib.LevenbergMarquardtOptimizer(factors, values).optimize()
-    return np.stack([values.atPose3(v).matrix() for v in range(num)])
+    at = values.atPose3 if T_i_j.shape[-1] == 4 else values.atPose2
+    return Found(np.stack([at(v).matrix() for v in range(num)]), weight)
+
+
+def _gnc(
+    lib: Any, factors: Any, values: Any, kernel: str, right: Sequence[int]
+) -> tuple[Any, np.ndarray]:
+    """Values, and the weight of each motion."""
+    params = lib.GncLMParams()
+    loss = lib.GncLossType
+    params.setLossType(loss.TLS if kernel == "GNC TLS" else loss.GM)
+    # Factor 0 is the prior.
+    params.setKnownInliers([0, *(1 + np.asarray(right, int)).tolist()])
+    optimizer = lib.GncLMOptimizer(factors, values, params)
+    found = optimizer.optimize()
+    return found, np.asarray(optimizer.getWeights())[1:]
+
+
+def _noises(lib: Any, num: int, information: np.ndarray | None) -> list[Any]:
+    """One for each motion."""
+    if information is None:
+        degrees, length = SIGMAS
+        sigmas = np.array([np.deg2rad(degrees)] * 3 + [length] * 3)
+        return [lib.noiseModel.Diagonal.Sigmas(sigmas)] * num
+    # In space GTSAM has rotations first.
+    order = [3, 4, 5, 0, 1, 2] if information.shape[-1] == 6 else [0, 1, 2]
+    ordered = information[:, order][:, :, order]
+    return [lib.noiseModel.Gaussian.Information(each) for each in ordered]

@@ -102,6 +102,18 @@ WORKLOADS = {
         double=True,
         quick=False,
     ),
+    "false_closures": Workload(
+        "False loop closures",
+        "Public pose graphs with false closures, float64: two random poses with the "
+        "motion and information of a true closure taken at random. From the motions "
+        "alone but where named. Distances from the clean optimum (chordal, without the "
+        "false ones) in the best common frame: medians over seeds of the means; "
+        "`e_t_max` and counts are those of the worst seed. `ratio` is SE-Sync's "
+        "objective of the true edges over its optimum. The picture shows the first "
+        "seed.",
+        double=True,
+        quick=False,
+    ),
     "large_graphs": Workload(
         "Large graphs",
         "A path in rings of 100 poses, 3.85 edges a pose, noise of 1 degree and 0.02 "

@@ -98,7 +98,8 @@ def methods() -> list[Method]:
 def _gtsam(kernel: str, graph: PoseGraph) -> np.ndarray:
     keep = np.asarray(graph.mask)
     T_i_j = on_group(np.asarray(graph.T_i_j, np.float64)[keep])
-    return robust(np.asarray(graph.edges)[keep], T_i_j, graph.num_poses, kernel=kernel)
+    edges = np.asarray(graph.edges)[keep]
+    return robust(edges, T_i_j, graph.num_poses, kernel=kernel).T_world_i
 
 
 def judge(

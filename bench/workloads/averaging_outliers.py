@@ -75,7 +75,7 @@ def _gtsam(
     kernel: str, graph: PoseGraph, edges: np.ndarray, T: np.ndarray, num: int
 ) -> np.ndarray:
     # It takes rotations of float64 accuracy.
-    return robust(edges, _orthonormal(T), num, kernel=kernel)
+    return robust(edges, _orthonormal(T), num, kernel=kernel).T_world_i
 
 
 def _orthonormal(T: np.ndarray) -> np.ndarray:
