@@ -27,80 +27,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bench.timing import cpu_model, num_cores, timed, versions
+from bench.workloads.averaging_data import H, N, large_graph, small_graph
 from jaxreg import Status
 from jaxreg.averaging import AveragingSolution, Correntropy, PoseGraphLM, average
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_errors, translation_errors
-
-
-N, H = 32, 465
-RING = 100
-
-
-def motions(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Homogeneous matrices."""
-    T = np.tile(np.eye(4), (len(t), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = R, t
-    return T
-
-
-def small_rotations(rng: np.random.Generator, num: int, degrees: float) -> np.ndarray:
-    """Normal rotation vectors of this standard deviation."""
-    return Rotation.from_rotvec(
-        np.deg2rad(degrees) * rng.normal(size=(num, 3))
-    ).as_matrix()
-
-
-def small_graph(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """True poses, edges and motions of one graph of a batch."""
-    X = motions(Rotation.random(N, rng).as_matrix(), rng.uniform(-0.5, 0.5, (N, 3)))
-    pairs = np.stack(np.triu_indices(N, 1), axis=1)
-    edges = pairs[np.sort(rng.choice(len(pairs), H, replace=False))]
-    error = motions(small_rotations(rng, H, 0.5), 0.005 * rng.normal(size=(H, 3)))
-    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ error
-    wrong = rng.choice(H, round(0.3 * H), replace=False)
-    R = Rotation.random(len(wrong), rng).as_matrix()
-    T[wrong] = motions(R, rng.uniform(-1, 1, (len(wrong), 3)))
-    return X, edges, T
-
-
-def large_graph(
-    num: int, outliers: float, seed: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """True poses, edges, motions, and which are wrong."""
-    rng = np.random.default_rng(seed)
-    step = np.arange(num)
-    around = 2 * np.pi * step / RING
-    down = np.pi * (0.1 + 0.8 * step / num)
-    radius = RING / (2 * np.pi)
-    t = radius * np.stack(
-        [
-            np.sin(down) * np.cos(around),
-            np.sin(down) * np.sin(around),
-            (num / RING / (0.8 * np.pi)) * np.cos(down) / radius,
-        ],
-        axis=1,
-    )
-    X = motions(Rotation.from_euler("zy", np.stack([around, down], 1)).as_matrix(), t)
-    near = [1, RING, RING + 1, RING - 1]
-    pairs = [np.stack([step[:-k], step[k:]], axis=1) for k in near]
-    thinned = [p[rng.random(len(p)) < 0.95] for p in pairs[1:]]
-    edges = np.concatenate([pairs[0], *thinned])
-    closures = np.flatnonzero(edges[:, 1] - edges[:, 0] > 1)
-    wrong = np.zeros(len(edges), bool)
-    wrong[rng.choice(closures, round(outliers * len(edges)), replace=False)] = True
-    error = motions(
-        small_rotations(rng, len(edges), 1.0), 0.02 * rng.normal(size=(len(edges), 3))
-    )
-    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ error
-    # As from two places that look like those of a true closure.
-    first = rng.integers(0, num, int(wrong.sum()))
-    second = (first + rng.integers(1, num, len(first))) % num
-    edges[wrong] = np.stack([first, second], axis=1)
-    return X, edges, T, wrong
 
 
 def memory() -> float:

@@ -52,16 +52,17 @@ def g2o_solver(path: Path, dim: int) -> Callable[[], np.ndarray]:
 
 def large_lm(
     edges: np.ndarray, T_i_j: np.ndarray, num: int, turn: float, shift: float
-) -> Callable[[], np.ndarray]:
+) -> Callable[[], Found]:
     """The same for motions `(e, 4, 4)` with deviations in radians and lengths."""
     lib: Any = importlib.import_module("gtsam")
     noise = lib.noiseModel.Diagonal.Sigmas(np.repeat([turn, shift], 3))
     factors = between(lib, edges, T_i_j, [noise] * len(edges))
 
-    def solve() -> np.ndarray:
+    def solve() -> Found:
         begin = lib.InitializePose3.initialize(factors)
         values = lib.LevenbergMarquardtOptimizer(factors, begin).optimize()
-        return np.stack([values.atPose3(v).matrix() for v in range(num)])
+        poses = np.stack([values.atPose3(v).matrix() for v in range(num)])
+        return Found(poses, None)
 
     return solve
 

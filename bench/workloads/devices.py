@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bench.averaging_scale import H, N, small_graph
 from bench.case import Case, Judged, Method, Options
 from bench.records import Metric, share
+from bench.workloads.averaging_data import H, N, small_graph
 from bench.workloads.filter_data import horse, horse_model, horse_name
 from bench.workloads.filter_methods import look_ups
 from bench.workloads.global_horse import judge as judge_horse
