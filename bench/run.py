@@ -139,6 +139,9 @@ def _measure(
     environment = os.environ | dict.fromkeys(_THREADS, str(len(cores)))
     environment["JAX_ENABLE_X64"] = "1" if known.double else "0"
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)  # first calls compile
+    if known.devices:
+        flag = f"--xla_force_host_platform_device_count={len(cores)}"
+        environment["XLA_FLAGS"] = f"{environment.get('XLA_FLAGS', '')} {flag}"
     crashed: set[tuple[str, str]] = set()
     # A process that is killed leaves its temporary files; ours go with the folder.
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:

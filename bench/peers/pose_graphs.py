@@ -172,3 +172,12 @@ def _noises(lib: Any, num: int, information: np.ndarray | None) -> list[Any]:
     order = [3, 4, 5, 0, 1, 2] if information.shape[-1] == 6 else [0, 1, 2]
     ordered = information[:, order][:, :, order]
     return [lib.noiseModel.Gaussian.Information(each) for each in ordered]
+
+
+def robust_many(task: tuple[str, np.ndarray, np.ndarray, int]) -> np.ndarray:
+    """Kernel, edges `(b, e, 2)`, motions `(b, e, 4, 4)` and number of poses."""
+    kernel, edges, T_i_j, num = task
+    found = [
+        robust(e, T, num, kernel=kernel) for e, T in zip(edges, T_i_j, strict=True)
+    ]
+    return np.stack([each.T_world_i for each in found])

@@ -16,6 +16,7 @@ class Workload(NamedTuple):
         cores: that its process is pinned to: one, or all that there are.
         double: whether JAX computes in float64 where asked.
         quick: whether it has cases of `--quick`.
+        devices: whether each core is a device of JAX, or all of them one.
     """
 
     title: str
@@ -23,6 +24,7 @@ class Workload(NamedTuple):
     cores: Literal["one", "all"] = "one"
     double: bool = False
     quick: bool = True
+    devices: bool = False
 
 
 WORKLOADS = {
@@ -87,6 +89,16 @@ WORKLOADS = {
         "Random graphs, noise of 0.5 degrees and 0.5 % of the size, a share of the "
         "motions uniformly random; from the motions alone. Success: mean errors within "
         "5 degrees and 5 % in the best common frame.",
+    ),
+    "averaging_batch": Workload(
+        "Motion averaging of many graphs",
+        "Random graphs as above, all in one call: one after the other on one device of "
+        "JAX, or on as many as there are cores, or side by side; GTSAM in as many "
+        "processes as there are cores. Then single graphs, called as they are and "
+        "inside the caller's `jit`.",
+        cores="all",
+        quick=False,
+        devices=True,
     ),
     "averaging_logs": Workload(
         "Motion averaging of real logs",

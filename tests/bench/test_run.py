@@ -294,6 +294,25 @@ def test_a_method_that_kills_its_process_is_a_row(
     assert row.why == "its process ended with code -11"
 
 
+def test_each_core_is_a_device_where_a_workload_asks_for_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    asked = {}
+
+    def process(command, environment, running: Path, longest: float) -> str:
+        asked[running.stem] = environment.get("XLA_FLAGS", "")
+        return ""
+
+    monkeypatch.setattr(run, "_process", process)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2})
+    monkeypatch.setenv("XLA_FLAGS", "--xla_dump_to=")
+    names = ["averaging_batch", "local_batch"]
+    run.run(run.Settings(names, False, None, tmp_path, tmp_path, False))
+    flag = "--xla_force_host_platform_device_count=3"
+    assert asked["running-averaging_batch"].split() == ["--xla_dump_to=", flag]
+    assert asked["running-local_batch"] == "--xla_dump_to="
+
+
 def test_every_workload_is_a_module_and_every_peer_a_name():
     folder = Path(worker.__file__).parent / "workloads"
     for name in WORKLOADS:
