@@ -1,7 +1,12 @@
-"""Relative motions to average."""
+"""Relative motions to average: generated, and real ones with real outliers."""
+
+from pathlib import Path
 
 import numpy as np
+import scipy.io
 from scipy.spatial.transform import Rotation
+
+from jaxreg.graph import PoseGraph
 
 
 #: Poses and edges of small graphs, poses of a ring of large ones.
@@ -69,3 +74,64 @@ def large_graph(
     second = (first + rng.integers(1, num, len(first))) % num
     edges[wrong] = np.stack([first, second], axis=1)
     return X, edges, T, wrong
+
+
+def on_group(T: np.ndarray) -> np.ndarray:
+    """Rotations made orthonormal, last rows exact."""
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    sign = np.linalg.det(U @ Vt)
+    U[..., -1] *= sign[..., None]
+    out = np.zeros_like(T)
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = U @ Vt, T[..., :3, 3], 1
+    return out
+
+
+def learning2sync(path: Path) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
+    """A scene as graph, true poses and frames that have one."""
+    scene = scipy.io.loadmat(path)
+    T_view_world = on_group(np.asarray(scene["Tstar"], dtype=np.float64))
+    num = len(T_view_world)
+    blocks = scene["T"].reshape(num, 4, num, 4).transpose(0, 2, 1, 3)
+    i, j = np.triu_indices(num, 1)
+    # The file maps view i into view j.
+    T_i_j = np.linalg.inv(on_group(blocks[i, j]))
+    graph = PoseGraph.from_edges(np.stack([i, j], 1), T_i_j.astype(np.float32), num)
+    return graph, np.linalg.inv(T_view_world), np.ones(num, bool)
+
+
+def read_log(path: Path) -> tuple[np.ndarray, np.ndarray, int]:
+    """Pairs, motions and number of fragments of a Redwood log."""
+    rows = np.array(path.read_text().split(), dtype=np.float64).reshape(-1, 19)
+    return (
+        rows[:, :2].astype(int),
+        on_group(rows[:, 3:].reshape(-1, 4, 4)),
+        int(rows[0, 2]),
+    )
+
+
+def chained(logs: list[Path]) -> tuple[np.ndarray, np.ndarray]:
+    """True poses along the true pairs, and the frames of the largest component."""
+    parts = [read_log(path) for path in logs if path.exists()]
+    edges = np.concatenate([p[0] for p in parts])
+    motions = np.concatenate([p[1] for p in parts])
+    num = parts[0][2]
+    best: dict[int, np.ndarray] = {}
+    for root in range(num):
+        poses = {root: np.eye(4)}
+        grown = True
+        while grown:
+            grown = False
+            for (i, j), T in zip(edges.tolist(), motions, strict=True):
+                if i in poses and j not in poses:
+                    poses[j], grown = poses[i] @ T, True
+                elif j in poses and i not in poses:
+                    poses[i], grown = poses[j] @ np.linalg.inv(T), True
+        if len(poses) > len(best):
+            best = poses
+        if 2 * len(best) > num:
+            break
+    T = np.tile(np.eye(4), (num, 1, 1))
+    known = np.zeros(num, bool)
+    for v, pose in best.items():
+        T[v], known[v] = pose, True
+    return T, known
