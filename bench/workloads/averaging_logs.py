@@ -5,25 +5,38 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
-from bench.averaging_real import (
-    METHODS,
-    chained,
-    frame_errors,
-    learning2sync,
-    on_group,
-    read_log,
-    told,
-)
 from bench.case import Case, Judged, Method, Options
 from bench.peers.pose_graphs import SIGMAS, robust
 from bench.records import Metric
+from bench.workloads.averaging_data import (
+    chained,
+    learning2sync,
+    on_group,
+    read_log,
+)
 from bench.workloads.local_pairs import written_out
-from jaxreg.averaging import AbstractAverager, Correntropy, average
+from jaxreg.averaging import (
+    AbstractAverager,
+    Correntropy,
+    LowRankSparse,
+    MotionAveraging,
+    SpanningTree,
+    average,
+)
 from jaxreg.graph import PoseGraph
 
 
+METHODS: dict[str, AbstractAverager] = {
+    "tree": SpanningTree(),
+    "LRS": LowRankSparse(),
+    "MA": MotionAveraging(),
+    "MCC paper": Correntropy(width="paper", initialiser=SpanningTree()),
+    "default": Correntropy(),
+}
 #: Graph, true poses, frames that have one.
 Scene = tuple[PoseGraph, np.ndarray, np.ndarray]
 
@@ -95,6 +108,13 @@ def methods() -> list[Method]:
     ]
 
 
+def told(graph: PoseGraph) -> PoseGraph:
+    """The graph with ten times the weight on motions between consecutive frames."""
+    consecutive = jnp.abs(graph.edges[:, 0] - graph.edges[:, 1]) == 1
+    weight = jnp.where(consecutive, 10 * graph.weight, graph.weight)
+    return eqx.tree_at(lambda g: g.weight, graph, weight)
+
+
 def _gtsam(kernel: str, graph: PoseGraph) -> np.ndarray:
     keep = np.asarray(graph.mask)
     T_i_j = on_group(np.asarray(graph.T_i_j, np.float64)[keep])
@@ -120,3 +140,25 @@ def judge(
         ],
         {"right frames": [100 * float(x) for x in shares]},
     )
+
+
+def frame_errors(
+    T: np.ndarray, T_true: np.ndarray, known: np.ndarray, degrees: float, metres: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Angles (degrees) and lengths in the common frame that has most frames right."""
+    T = T.astype(np.float64)
+    errors, most = (np.zeros(0), np.zeros(0)), -1
+    for v in np.flatnonzero(known):
+        moved = T_true[v] @ np.linalg.inv(T[v]) @ T
+        shift = np.linalg.norm(moved[:, :3, 3] - T_true[:, :3, 3], axis=1)
+        turn = angles(moved[:, :3, :3], T_true[:, :3, :3])
+        right = ((turn < degrees) & (shift < metres) & known).sum()
+        if right > most:
+            errors, most = (turn, shift), right
+    return errors
+
+
+def angles(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """Between rotations, degrees."""
+    cosine = (np.einsum("vij,vij->v", A, B) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
