@@ -102,6 +102,16 @@ WORKLOADS = {
         quick=False,
         devices=True,
     ),
+    "averaging_paper": Workload(
+        "Motion averaging of the MCC paper's tables",
+        "Tables I to III of the MCC paper on the motions that `reconstruct` estimates "
+        "without a guess, each pair of scans once: those that it trusts, those of "
+        "largest overlap (the paper's share of all pairs), and all, most of them of "
+        "scans that share no surface. All edges weigh the same but in wMA and where "
+        "overlap is named, which weighs them. `agree`: edges whose rotation is within "
+        "0.1 rad of that of the answer. Means over two seeds of the motions.",
+        quick=False,
+    ),
     "averaging_logs": Workload(
         "Motion averaging of real logs",
         "Relative motions that fast global registration found between the views of "
