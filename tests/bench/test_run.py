@@ -299,8 +299,9 @@ def test_each_core_is_a_device_where_a_workload_asks_for_it(
 ):
     asked = {}
 
-    def process(command, environment, running: Path, longest: float) -> str:
-        asked[running.stem] = environment.get("XLA_FLAGS", "")
+    def process(command: list[str], environment: dict, *_: object) -> str:
+        workload = json.loads(command[-1])["workload"]
+        asked[workload] = environment.get("XLA_FLAGS", "")
         return ""
 
     monkeypatch.setattr(run, "_process", process)
@@ -309,8 +310,8 @@ def test_each_core_is_a_device_where_a_workload_asks_for_it(
     names = ["averaging_batch", "local_batch"]
     run.run(run.Settings(names, False, None, tmp_path, tmp_path, False))
     flag = "--xla_force_host_platform_device_count=3"
-    assert asked["running-averaging_batch"].split() == ["--xla_dump_to=", flag]
-    assert asked["running-local_batch"] == "--xla_dump_to="
+    assert asked["averaging_batch"].split() == ["--xla_dump_to=", flag]
+    assert asked["local_batch"] == "--xla_dump_to="
 
 
 def test_every_workload_is_a_module_and_every_peer_a_name():
