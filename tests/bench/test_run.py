@@ -1,5 +1,6 @@
 """What is measured, kept, and said of what is absent, fails or is interrupted."""
 
+import json
 import os
 import signal
 import sys
