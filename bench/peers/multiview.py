@@ -25,6 +25,8 @@ class Multiway(NamedTuple):
         least: share of points that meet, below which a pair is left out.
         prune: confidence of the line process below which an edge is pruned.
         camera_at_origin: as in `Features`.
+        crowd: where scans are noisy, how many points must lie within which distance of
+            a point for it to stay.
     """
 
     voxel: float
@@ -32,9 +34,12 @@ class Multiway(NamedTuple):
     least: float = 0.3
     prune: float = 0.25
     camera_at_origin: bool = True
+    crowd: tuple[int, float] | None = None
 
     def solve(self, scans: list[np.ndarray], seed: int) -> np.ndarray:
         """Poses `(v, 4, 4)` in the frame of scan 0; NaN for what is not joined."""
+        if self.crowd is not None:
+            scans = [_without_noise(scan, *self.crowd) for scan in scans]
         pair = Features("RANSAC", self.voxel, camera_at_origin=self.camera_at_origin)
         clouds = [pair.prepare(scan) for scan in scans]
         motions, scores = {}, np.zeros((len(scans),) * 2)
@@ -96,6 +101,13 @@ class Multiway(NamedTuple):
         )
         found = np.stack([np.asarray(node.pose) for node in graph.nodes])
         return np.where(np.isnan(T_world_i), np.nan, found)
+
+
+def _without_noise(scan: np.ndarray, num: int, radius: float) -> np.ndarray:
+    lib: Any = importlib.import_module("open3d")
+    vectors = lib.utility.Vector3dVector(scan.astype(np.float64))
+    cloud, _ = lib.geometry.PointCloud(vectors).remove_radius_outlier(num, radius)
+    return np.asarray(cloud.points)
 
 
 def _pairs(num: int) -> list[tuple[int, int]]:

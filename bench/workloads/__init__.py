@@ -170,8 +170,8 @@ WORKLOADS = {
         "Commands as processes of their own, from an empty folder to written files, "
         "pictures and page: with an empty cache folder, so that they compile, and with "
         "that of an earlier call. `compile` and `run` are parts of that time as the "
-        "command reports them. `before` and `after` are SE-Sync's objective of the "
-        "spanning tree and of the answer.",
+        "command reports them. `objective` is SE-Sync's, at the worst seed; "
+        "before, it is that of the spanning tree.",
         cores="all",
         double=True,
         quick=False,

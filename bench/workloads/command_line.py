@@ -148,10 +148,10 @@ def judge_scans(answers: list[Any]) -> Judged:
 def judge_graph(graph: PoseGraph, answers: list[Any]) -> Judged:
     """SE-Sync's objective, of the tree and in the end, at the worst seed."""
     after = max(_objective(graph, answer) for answer in answers)
-    metrics = [Metric("after", after, "", "down", 0.05 * after), *_times(answers)]
+    metrics = [Metric("objective", after, "", "down", 0.05 * after), *_times(answers)]
     if "objective_before" in answers[0]:
         before = answers[0]["objective_before"]
-        metrics.insert(0, Metric("before", before, "", "down"))
+        metrics.insert(0, Metric("objective before", before, "", "down"))
     return Judged(metrics)
 
 

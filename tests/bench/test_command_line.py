@@ -66,7 +66,7 @@ def test_graphs_are_judged_alike_whoever_wrote_the_poses(tmp_path: Path):
     worse = ours | {"objective_after": 5.0}
     metrics = command_line.judge_graph(graph, [ours, worse]).metrics
     assert [(m.key, m.value) for m in metrics] == [
-        ("before", 9.0), ("after", 5.0), ("run", 1.0)
+        ("objective before", 9.0), ("objective", 5.0), ("run", 1.0)
     ]  # fmt: skip
 
 
