@@ -81,7 +81,7 @@ def _full(options: Options) -> Iterator[Scans]:
     for name, (folder, file, _) in SETS.items():
         if (options.data / folder / file).exists():
             title, scans, T_world_i = load_scans(name, options.data)
-            yield Scans(title, scans, T_world_i, 0.0025, 0.3, True)
+            yield Scans(title, scans, T_world_i, 0.0025, 0.5, True)
     folder = options.data / "kitchen_fragments"
     if folder.exists():
         yield _kitchen(folder)

@@ -59,12 +59,10 @@ class Mixture(NamedTuple):
 
 def cases(options: Options) -> Iterator[Case]:
     """A case per way to spoil scans, on real ones where they lie."""
-    clean = Multiway(0.0025, 0.001, 0.3)
+    clean = Multiway(0.0025, 0.001, 0.5)
     for mixture in _mixtures(options):
-        # Features of noise take it minutes a pair, so its user drops that before.
-        peer = clean
-        if mixture.noisy:
-            peer = clean._replace(least=0.5, crowd=(4, 0.002))
+        # With the noise a pair takes it the better part of a minute: its user drops it.
+        peer = clean._replace(crowd=(4, 0.002)) if mixture.noisy else clean
         yield Case(
             name=mixture.name,
             data=f"{len(mixture.scans)} scans",
