@@ -8,7 +8,7 @@ Prints the seconds between reading and writing.
 import sys
 import time
 
-import gtsam
+import gtsam  # pyright: ignore[reportMissingImports]
 import numpy as np
 
 
