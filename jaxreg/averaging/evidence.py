@@ -100,15 +100,17 @@ def coherence(graph: PoseGraph, T_world_i: Array, scale: Array) -> Array:
     edges to the nearest measured neighbours of each frame, which counts the more the
     fewer of its neighbours those are, and only so far as it is more than chance would
     give to as many edges: a search finds what profits by chance. Dense over frames.
+
+    Where edges are few, nearly all neighbours are among the nearest and say nothing
+    else, and many edges are those of a tree, which agrees with itself. There: the share
+    of the edges beyond a tree that agree, the mean of `redundancies` over the scales.
     """
-    sq = squared_errors(graph, T_world_i, scale)
     count = votes(graph)
-    agreed = agrees(sq)
     if graph.num_edges <= _NEIGHBOURS * graph.num_poses:
-        # Nearly all neighbours are among the nearest: they say nothing else. But a tree
-        # agrees with its own edges, which are many of these.
         spare = jnp.sum(count) - _free(graph, count)
         return redundancy(graph, T_world_i) / jnp.maximum(len(SCALES) * spare, 1)
+    sq = squared_errors(graph, T_world_i, scale)
+    agreed = agrees(sq)
     i, j, num = graph.edges[:, 0], graph.edges[:, 1], graph.num_poses
     gap = product(lie.inverse(T_world_i)[i], T_world_i[j])
     near = graph.dim - jnp.trace(lie.rotation(gap), axis1=-2, axis2=-1)
