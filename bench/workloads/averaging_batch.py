@@ -15,7 +15,7 @@ from bench.case import Case, Judged, Method, Options
 from bench.peers.pose_graphs import SIGMAS, robust, robust_many
 from bench.records import error, share
 from bench.timing import num_cores
-from bench.workloads.averaging_data import H, N, small_graph
+from bench.workloads.averaging_data import H, N, batch_of, small_graph
 from bench.workloads.local_pairs import written_out
 from jaxreg.averaging import Correntropy, average
 from jaxreg.graph import PoseGraph
@@ -32,14 +32,7 @@ def cases(options: Options) -> Iterator[Case]:
     rng = np.random.default_rng(0)
     drawn = [small_graph(rng) for _ in range(GRAPHS)]
     X, edges, T = (np.stack(x) for x in zip(*drawn, strict=True))
-    graphs = PoseGraph(
-        edges=jnp.asarray(edges, jnp.int32),
-        T_i_j=jnp.asarray(T, jnp.float32),
-        weight=jnp.ones((GRAPHS, H), jnp.float32),
-        mask=jnp.ones((GRAPHS, H), bool),
-        information=None,
-        num_poses=N,
-    )
+    graphs = batch_of(edges, T)
     cores = num_cores()
     peer = f"{PEER}, {cores} processes"
     solve = partial(_in_processes, _pool(cores), cores, edges, T)

@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import scipy.io
 from scipy.spatial.transform import Rotation
 
+from jaxreg.averaging import SpanningTree, average
 from jaxreg.graph import PoseGraph
+from jaxreg.io import read_log
 
 
 #: Poses and edges of small graphs, poses of a ring of large ones.
@@ -38,6 +41,19 @@ def small_graph(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     R = Rotation.random(len(wrong), rng).as_matrix()
     T[wrong] = motions(R, rng.uniform(-1, 1, (len(wrong), 3)))
     return X, edges, T
+
+
+def batch_of(edges: np.ndarray, T_i_j: np.ndarray) -> PoseGraph:
+    """Small graphs along a leading axis, on JAX's default device."""
+    num = len(edges)
+    return PoseGraph(
+        edges=jnp.asarray(edges, jnp.int32),
+        T_i_j=jnp.asarray(T_i_j, jnp.float32),
+        weight=jnp.ones((num, H), jnp.float32),
+        mask=jnp.ones((num, H), bool),
+        information=None,
+        num_poses=N,
+    )
 
 
 def large_graph(
@@ -99,39 +115,13 @@ def learning2sync(path: Path) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
     return graph, np.linalg.inv(T_view_world), np.ones(num, bool)
 
 
-def read_log(path: Path) -> tuple[np.ndarray, np.ndarray, int]:
-    """Pairs, motions and number of fragments of a Redwood log."""
-    rows = np.array(path.read_text().split(), dtype=np.float64).reshape(-1, 19)
-    return (
-        rows[:, :2].astype(int),
-        on_group(rows[:, 3:].reshape(-1, 4, 4)),
-        int(rows[0, 2]),
-    )
-
-
 def chained(logs: list[Path]) -> tuple[np.ndarray, np.ndarray]:
     """True poses along the true pairs, and the frames of the largest component."""
     parts = [read_log(path) for path in logs if path.exists()]
-    edges = np.concatenate([p[0] for p in parts])
-    motions = np.concatenate([p[1] for p in parts])
-    num = parts[0][2]
-    best: dict[int, np.ndarray] = {}
-    for root in range(num):
-        poses = {root: np.eye(4)}
-        grown = True
-        while grown:
-            grown = False
-            for (i, j), T in zip(edges.tolist(), motions, strict=True):
-                if i in poses and j not in poses:
-                    poses[j], grown = poses[i] @ T, True
-                elif j in poses and i not in poses:
-                    poses[i], grown = poses[j] @ np.linalg.inv(T), True
-        if len(poses) > len(best):
-            best = poses
-        if 2 * len(best) > num:
-            break
-    T = np.tile(np.eye(4), (num, 1, 1))
-    known = np.zeros(num, bool)
-    for v, pose in best.items():
-        T[v], known[v] = pose, True
-    return T, known
+    edges = np.concatenate([part.edges for part in parts])
+    T_i_j = np.concatenate([part.T_i_j for part in parts])
+    graph = PoseGraph.from_edges(edges, T_i_j, parts[0].num_poses)
+    found = average(graph, SpanningTree(by="path"))
+    component = np.asarray(found.component)
+    known = component == np.bincount(component).argmax()
+    return np.asarray(found.T_world_i, float), known

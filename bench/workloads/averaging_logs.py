@@ -16,7 +16,6 @@ from bench.workloads.averaging_data import (
     chained,
     learning2sync,
     on_group,
-    read_log,
 )
 from bench.workloads.local_pairs import written_out
 from jaxreg.averaging import (
@@ -28,6 +27,7 @@ from jaxreg.averaging import (
     average,
 )
 from jaxreg.graph import PoseGraph
+from jaxreg.io import read_log
 
 
 METHODS: dict[str, AbstractAverager] = {
@@ -70,10 +70,8 @@ def _logs(root: Path) -> list[Scene]:
         T_true, known = chained(
             [path.parent / "gt.log", path.parent / "3dlomatch_gt.log"]
         )
-        edges, T_i_j, num = read_log(path)
-        graph = PoseGraph.from_edges(edges, T_i_j.astype(np.float32), num)
         # One shape for all logs: one compilation for each number of fragments.
-        scenes.append((graph.padded(800), T_true, known))
+        scenes.append((read_log(path).padded(800), T_true, known))
     return scenes
 
 

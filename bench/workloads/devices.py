@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from bench.case import Case, Judged, Method, Options
-from bench.records import Metric, share
-from bench.workloads.averaging_data import H, N, small_graph
+from bench.records import Metric
+from bench.workloads.averaging_batch import judge as judge_averaged
+from bench.workloads.averaging_data import H, N, batch_of, small_graph
 from bench.workloads.filter_data import horse, horse_model, horse_name
 from bench.workloads.filter_methods import look_ups
 from bench.workloads.global_horse import judge as judge_horse
@@ -23,8 +24,6 @@ from bench.workloads.neighbours import queries_off, sculpture_points
 from bench.workloads.prepared_model import ours
 from jaxreg import register
 from jaxreg.averaging import average
-from jaxreg.graph import PoseGraph
-from jaxreg.metrics import rotation_errors, translation_errors
 from jaxreg.neighbours import BruteForce
 
 
@@ -105,24 +104,15 @@ def _graphs() -> Case:
     many = jax.jit(lambda g: jax.lax.map(average, g))
 
     def solve() -> np.ndarray:
-        graphs = PoseGraph(
-            edges=jnp.asarray(edges, jnp.int32),
-            T_i_j=jnp.asarray(T, jnp.float32),
-            weight=jnp.ones((GRAPHS, H), jnp.float32),
-            mask=jnp.ones((GRAPHS, H), bool),
-            information=None,
-            num_poses=N,
-        )
-        return np.asarray(many(graphs).T_world_i)
+        return np.asarray(many(batch_of(edges, T)).T_world_i)
 
     method = Method("jaxreg average", "jaxreg", "lax.map", solve, on_accelerator=True)
     name = f"{GRAPHS} graphs of {N} poses, {H} edges, 30 % wrong"
-    return _case(name, "generated graphs", method, GRAPHS, "graphs", partial(_right, X))
-
-
-def _right(X: np.ndarray, answers: list[Any]) -> Judged:
-    found, true = jnp.asarray(answers[0]), jnp.asarray(X, jnp.float32)
-    e_R = jax.vmap(lambda a, b: jnp.mean(rotation_errors(a, b, "best")))(found, true)
-    e_t = jax.vmap(lambda a, b: jnp.mean(translation_errors(a, b, "best")))(found, true)
-    right = (np.rad2deg(e_R) < 5) & (np.asarray(e_t) < 0.05)
-    return Judged([share("success", right.tolist(), 5.0)])
+    return _case(
+        name,
+        "generated graphs",
+        method,
+        GRAPHS,
+        "graphs",
+        lambda x: judge_averaged(X, x[0]),
+    )

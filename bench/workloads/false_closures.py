@@ -23,6 +23,7 @@ from jaxreg.averaging import (
     PoseGraphLM,
     average,
 )
+from jaxreg.averaging.tree import along_frames
 from jaxreg.graph import PoseGraph
 from jaxreg.io.g2o import read_g2o
 from jaxreg.metrics import (
@@ -110,20 +111,12 @@ def with_false_closures(clean: PoseGraph, share: float, seed: int) -> Trial:
         clean.num_poses,
         information=information[rows],
     )
-    return Trial(graph, np.arange(len(rows)) >= len(edges), chained(clean))
+    return Trial(graph, np.arange(len(rows)) >= len(edges), odometry(clean))
 
 
-def chained(graph: PoseGraph) -> np.ndarray:
-    """Poses along the edges between successive poses, the first of each pair."""
-    edges, T_i_j = np.asarray(graph.edges), np.asarray(graph.T_i_j)
-    step: dict[int, np.ndarray] = {}
-    for (i, j), T in zip(edges.tolist(), T_i_j, strict=True):
-        if abs(i - j) == 1:
-            step.setdefault(min(i, j), T if i < j else np.linalg.inv(T))
-    poses = [np.eye(graph.dim + 1)]
-    for k in range(graph.num_poses - 1):
-        poses.append(poses[-1] @ step[k])
-    return np.stack(poses)
+def odometry(graph: PoseGraph) -> np.ndarray:
+    """Poses along the edges between successive frames."""
+    return np.asarray(along_frames(graph), float)
 
 
 def methods(graph: str, clean: PoseGraph) -> list[Method]:
@@ -152,7 +145,7 @@ def methods(graph: str, clean: PoseGraph) -> list[Method]:
 
 
 def _odometry(trial: Trial) -> Found:
-    return Found(chained(trial.graph), None)
+    return Found(odometry(trial.graph), None)
 
 
 def _own(method: AbstractAverager, from_odometry: bool, trial: Trial) -> Found:

@@ -11,7 +11,7 @@ from bench.case import Case, Judged, Method, Options
 from bench.peers.pose_graphs import Found, large_lm, robust
 from bench.records import Metric, error
 from bench.workloads.averaging_data import large_graph
-from bench.workloads.false_closures import chained
+from bench.workloads.false_closures import odometry
 from bench.workloads.local_pairs import written_out
 from jaxreg.averaging import AbstractAverager, Correntropy, PoseGraphLM, average
 from jaxreg.graph import PoseGraph
@@ -57,7 +57,7 @@ def _case(num: int, outliers: float, *, quick: bool) -> Case:
         methods.append(Method("GTSAM LM", "gtsam", text, prepare=solver))
     if num <= LARGEST_GNC[outliers]:
         text = "from the path, the true deviations; the path is right"
-        solve = partial(_gnc, edges, T, num, information, chained(graph))
+        solve = partial(_gnc, edges, T, num, information, odometry(graph))
         methods.append(Method("GTSAM GNC", "gtsam", text, solve))
     # Of those that take a minute.
     long = outliers > 0 and num != 10_000
