@@ -10,6 +10,7 @@ from typing import Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core.compile import compiled
 from jaxreg.geometry import lie
 from jaxreg.geometry.kabsch import nearest_rotation
 from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
@@ -114,6 +115,7 @@ def _mean(x: Array, mask: Array | None) -> Array:
     return jnp.sum(jnp.where(mask, x, 0)) / count
 
 
+@compiled
 def chordal_objective(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"]
 ) -> Float[Array, ""]:

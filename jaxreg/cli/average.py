@@ -107,13 +107,17 @@ class Average(Options):
                 write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids)
                 placed = np.asarray(sol.placed)
                 write_tum(
-                    staging / "poses.tum", sol.T_world_i[placed], timestamps=ids[placed]
+                    staging / "poses.tum",
+                    np.asarray(sol.T_world_i)[placed],
+                    timestamps=ids[placed],
                 )
             document = _document(sol, ids, objective)
             document["edges"] = [
                 {"i": int(ids[i]), "j": int(ids[j]), "weight": float(w)}
                 for (i, j), w in zip(
-                    np.asarray(graph.edges).tolist(), sol.edge_weight, strict=True
+                    np.asarray(graph.edges).tolist(),
+                    np.asarray(sol.edge_weight),
+                    strict=True,
                 )
             ]
             document |= {
