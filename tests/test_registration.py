@@ -1,10 +1,8 @@
-"""`register` as its users call it."""
+"""`register` as its users call it, of one pair."""
 
-import dataclasses
 import os
 import subprocess
 import sys
-from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -12,35 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import blob, half_noise, motion, move, pose_error
+from pairs import BESL_MCKAY, FILTER, Centroids, M, N, pair
 
 import jaxreg as jr
 from jaxreg import Status
-from jaxreg.cloud import PointCloud
 from jaxreg.datasets import sculpture_scans
-from jaxreg.local import AbstractRegistrar, Modes, RegistrationSolution
-from jaxreg.registration import many
-from jaxreg.robust import L1, L2
+from jaxreg.local import AbstractRegistrar
+from jaxreg.robust import L1
 
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
-
-N, M = 500, 800
 KEY = jax.random.key(0)
-FILTER = jr.ParticleFilter(
-    num_prior=256, num_particles=32, num_times=4, num_points=128, num_modes=2
-)
-
-
-def _pair(d: int, seed: int = 0, **kwargs):
-    T = motion(seed, d, **kwargs)
-    return move(np.linalg.inv(T), blob(N, d, seed=1)), blob(M, d, seed=2), T
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_filter_finds_any_rotation_without_a_guess(d):
     for seed in range(4):
-        source, target, T = _pair(d, seed)
+        source, target, T = pair(d, seed)
         sol = jr.register(source, target, FILTER, key=jax.random.key(seed))
         angle, shift = pose_error(sol.T_target_source, T)
         assert angle < 0.03, (seed, sol)
@@ -51,7 +38,7 @@ def test_filter_finds_any_rotation_without_a_guess(d):
 
 def test_default_method_finds_a_partial_overlap():
     # The source keeps the side x > -0.2 of the object and gains 15 % of clutter.
-    source, target, T = _pair(3, 5)
+    source, target, T = pair(3, 5)
     seen = blob(N, 3, seed=1)[:, 0] > -0.2
     rng = np.random.default_rng(0)
     source[~seen] = source[seen][: np.sum(~seen)]
@@ -93,7 +80,8 @@ def test_a_patch_of_a_smooth_surface_is_ambiguous():
 
 
 PLANE = jr.ICP()
-BESL_MCKAY = jr.ICP(jr.PointToPoint(), L2(), jr.ClosedForm(), max_steps=200)
+
+
 L1_POINT = jr.ICP(jr.PointToPoint(), L1(), jr.GaussNewton(), max_steps=200)
 
 
@@ -110,7 +98,7 @@ L1_POINT = jr.ICP(jr.PointToPoint(), L1(), jr.GaussNewton(), max_steps=200)
     ids=["2-plane", "2-besl-mckay", "3-plane", "3-besl-mckay", "3-l1", "3-table"],
 )
 def test_icp_from_a_near_guess(d, method):
-    source, target, T = _pair(d, 3, angle=0.5)
+    source, target, T = pair(d, 3, angle=0.5)
     if isinstance(method.residual, jr.PointToPoint):
         target = blob(4000, d, seed=2)  # sparse samples hold points fast
     init = motion(9, d, angle=0.12, shift=0.05) @ T
@@ -134,7 +122,7 @@ def test_half_of_the_points_may_be_noise():
 
 
 def test_unit_and_place_of_the_input_do_not_matter():
-    source, target, T = _pair(3, 2)
+    source, target, T = pair(3, 2)
     key = jax.random.key(1)
     sol = jr.register(source, target, FILTER, key=key)
     in_mm = jr.register(1000 * source, 1000 * target, FILTER, key=key)
@@ -156,7 +144,7 @@ def test_unit_and_place_of_the_input_do_not_matter():
     ids=["points", "default"],
 )
 def test_moving_both_clouds_moves_the_answer(method, tolerance):
-    source, target, T = _pair(3, 4, angle=0.3)
+    source, target, T = pair(3, 4, angle=0.3)
     A, B = motion(11, 3), motion(12, 3)
     init = motion(9, 3, angle=0.2, shift=0.1) @ T
     T = jr.register(source, target, method, init=init).T_target_source
@@ -167,14 +155,14 @@ def test_moving_both_clouds_moves_the_answer(method, tolerance):
 
 
 def test_same_key_same_bits():
-    source, target, _ = _pair(3, 0)
+    source, target, _ = pair(3, 0)
     first, again = (
         jr.register(source, target, FILTER, key=jax.random.key(7)) for _ in range(2)
     )
     np.testing.assert_array_equal(first.T_target_source, again.T_target_source)
     program = (
-        "import jax, numpy, jaxreg, test_registration as t;"
-        "source, target, _ = t._pair(3, 0); key = jax.random.key(7);"
+        "import jax, numpy, jaxreg, pairs as t;"
+        "source, target, _ = t.pair(3, 0); key = jax.random.key(7);"
         "sol = jaxreg.register(source, target, t.FILTER, key=key);"
         "print(numpy.asarray(sol.T_target_source).tobytes().hex())"
     )
@@ -193,195 +181,8 @@ def test_same_key_same_bits():
     assert bytes.fromhex(out.strip()) == np.asarray(first.T_target_source).tobytes()
 
 
-class _Centroids(AbstractRegistrar):
-    """Puts centroid on centroid: compiles in no time."""
-
-    def prepare(self, points, mask):
-        return PointCloud(points, jnp.zeros_like(points), mask)
-
-    def solve(self, source, target, init, key=None):
-        zero, d = jnp.zeros((), source.points.dtype), source.points.shape[1]
-        H = jnp.zeros((3 * d - 3, 3 * d - 3), zero.dtype)
-        count = jnp.zeros((), jnp.int32)
-        T = jnp.eye(d + 1, dtype=zero.dtype)
-        if key is not None:
-            jax.random.split(key)  # a key that methods can use
-        return RegistrationSolution(
-            T_target_source=T,
-            status=count,
-            fitness=zero,
-            inlier_rmse=zero,
-            num_inliers=jnp.sum(source.mask, dtype=jnp.int32),
-            overlap=zero,
-            num_steps=count,
-            H=H,
-            b=H[0],
-            error=zero,
-            covariance=H,
-            modes=Modes.alone(T, zero, zero, zero, H),
-        )
-
-
-@pytest.fixture
-def compiled():
-    """Names of functions, as they are compiled."""
-    names = []
-
-    def hear(event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event.endswith("backend_compile_duration"):
-            names.append(str(kwargs["fun_name"]))
-
-    jax.monitoring.register_event_duration_secs_listener(hear)
-    yield names
-    jax.monitoring.unregister_event_duration_listener(hear)
-
-
-def _ragged(num: int):
-    rng = np.random.default_rng(0)
-    rows = np.arange(num)
-    sources = [rng.standard_normal((450 + k, 3)).astype(np.float32) for k in rows]
-    targets = [rng.standard_normal((860 - k, 3)).astype(np.float32) for k in rows]
-    return sources, targets
-
-
-def test_a_hundred_sizes_compile_once(compiled):
-    sources, targets = _ragged(100)
-    source_mask = [None] * 99 + [np.arange(549) < 100]
-    sol = jr.register(sources, targets, _Centroids(), source_mask=source_mask)
-    programs = [name for name in compiled if "register" in name]
-    assert len(programs) == 1
-    assert len(compiled) < 20  # what the host does compiles for no size of its own
-    alike = [np.stack([x[:100] for x in xs]) for xs in (sources, targets)]
-    batch = jr.register(alike[0], alike[1], _Centroids()).T_target_source[:, :3, 3]
-    np.testing.assert_allclose(batch, alike[1].mean(1) - alike[0].mean(1), atol=1e-5)
-    sources[-1] = sources[-1][:100]
-    shift = [t.mean(0) - s.mean(0) for s, t in zip(sources, targets, strict=True)]
-    np.testing.assert_allclose(sol.T_target_source[:, :3, 3], shift, atol=1e-5)
-    np.testing.assert_array_equal(sol.num_inliers, [len(s) for s in sources])
-
-
-def test_single_pairs_of_similar_sizes_share_a_program(compiled):
-    sources, targets = _ragged(100)
-    for k in (0, 20, 60):  # up to 512 and 896 rows
-        sol = jr.register(sources[k], targets[k], _Centroids())
-        shift = targets[k].mean(0) - sources[k].mean(0)
-        np.testing.assert_allclose(sol.T_target_source[:3, 3], shift, atol=1e-5)
-        assert int(sol.num_inliers) == len(sources[k])
-    assert len([name for name in compiled if "register" in name]) == 1
-    assert len(compiled) < 20
-
-
-def test_lists_of_very_different_sizes_are_grouped(monkeypatch, compiled):
-    sources, targets = _ragged(9)
-    sources[4] = sources[4][:5]
-    targets[6] = targets[6][:0]
-    monkeypatch.setattr(many, "_MOST_PADDING", 300)
-    sol = jr.register(sources, targets, _Centroids())
-    assert len([name for name in compiled if "register" in name]) == 3
-    few = np.arange(9) == 6
-    np.testing.assert_array_equal(
-        sol.status, np.where(few, Status.TOO_FEW_POINTS, Status.CONVERGED)
-    )
-    shift = [t.sum(0) / max(len(t), 1) for t in targets]
-    shift = np.array(shift) - [s.mean(0) for s in sources]
-    shift[6] = 0
-    np.testing.assert_allclose(sol.T_target_source[:, :3, 3], shift, atol=1e-5)
-    inside = jax.jit(lambda s, t: jr.register(s, t, _Centroids()).T_target_source)
-    np.testing.assert_allclose(inside(sources, targets), sol.T_target_source, atol=1e-6)
-
-
-def test_progress_over_many_pairs_rises_to_their_number():
-    calls = []
-
-    def run(sources, targets):
-        method, hear = _Centroids(), lambda *call: calls.append(call)
-        return jr.register(sources, targets, method, progress=hear).T_target_source
-
-    sources, targets = _ragged(20)
-    run(sources, targets)
-    stages, done, totals = zip(*calls, strict=True)
-    assert set(stages) == {"registering pairs"}
-    assert set(totals) == {20}
-    assert (done[0], done[-1]) == (0, 20)
-    assert len(done) > 3
-    assert all(a < b for a, b in pairwise(done))
-    calls.clear()
-    jax.jit(run)(sources, targets)
-    assert not calls
-
-
-@pytest.mark.parametrize("name", ["filter", "icp"])
-def test_padding_changes_an_answer_by_rounding_only(name, compiled):
-    pairs = [_pair(3, seed, angle=0.3) for seed in (3, 4)]
-    sources, targets, T = (list(x) for x in zip(*pairs, strict=True))
-    sources.append(sources[0][:40])  # too few for a search, but some
-    targets.append(targets[0][:0])
-    T.append(np.eye(4))
-    init = [motion(9, 3, angle=0.1, shift=0.05) @ x for x in T]
-    if name == "filter":
-        method, init, key = FILTER, None, jax.random.key(7)
-        other = dataclasses.replace(method, min_overlap=0.2)
-        keys = list(jax.random.split(key, 3))
-    else:
-        method, key, keys = jr.ICP(), None, [None] * 3
-        other = jr.ICP(tolerance=1e-3, width_end=1.5)
-    sol = jr.register(sources, targets, method, init, key)
-    for k in range(2):
-        guess = None if init is None else init[k]
-        alone = jr.register(sources[k], targets[k], method, guess, keys[k])
-        lane = jax.tree.map(lambda x, k=k: x[k], sol)
-        for field in ("T_target_source", "fitness", "overlap", "inlier_rmse"):
-            np.testing.assert_allclose(
-                getattr(lane, field), getattr(alone, field), atol=1e-3, err_msg=field
-            )
-        assert int(lane.status) == int(alone.status)
-    assert int(sol.status[2]) == Status.TOO_FEW_POINTS
-    compiled.clear()
-    jr.register(sources, targets, other, init, key)
-    assert not [name for name in compiled if "register" in name]
-
-
-def test_threads_keep_the_precision_of_the_caller():
-    with jax.enable_x64(True):
-        source, target, _ = _pair(3, 3, angle=0.2)
-        pairs = [np.stack([x.astype(float)] * 3) for x in (source, target)]
-        T, again = (
-            jr.register(pairs[0], pairs[1], _Centroids(), batch_size=k).T_target_source
-            for k in (1, 2)
-        )
-        assert T.dtype == np.float64
-        np.testing.assert_allclose(again, T, atol=1e-12)
-        shift = pairs[1].mean(1) - pairs[0].mean(1)
-        np.testing.assert_allclose(T[:, :3, 3], shift, atol=1e-12)
-
-
-def test_pairs_side_by_side_have_the_answers_and_the_memory_of_their_number():
-    method = BESL_MCKAY
-    pairs = [_pair(2, seed, angle=0.2) for seed in range(5)]
-    arrays = [np.stack(x).astype(np.float32) for x in zip(*pairs, strict=True)]
-
-    def run(batch_size: int, repeats: int = 1):
-        """Poses, and bytes beyond inputs, of which a copy is made, and outputs."""
-        many = [np.tile(x, (repeats, 1, 1)) for x in arrays]
-
-        def poses(source, target, T):
-            found = jr.register(source, target, method, T, batch_size=batch_size)
-            return found.T_target_source
-
-        program = jax.jit(poses).lower(*many).compile()
-        memory = program.memory_analysis()
-        assert memory is not None
-        copied = sum(x.nbytes for x in many)
-        return program(*many), memory.temp_size_in_bytes - copied
-
-    one, two, more = run(1), run(2), run(2, 4)
-    np.testing.assert_allclose(two[0], one[0], atol=1e-5)
-    assert one[1] < two[1] < 2 * (1e7 + 900 * (N + M))
-    assert more[1] < 1.2 * two[1]
-
-
 def test_masked_and_non_finite_rows_do_not_count():
-    source, target, T = _pair(3, 3, angle=0.5)
+    source, target, T = pair(3, 3, angle=0.5)
     init = motion(9, 3, angle=0.1, shift=0.05) @ T
     valid, junk, dirty = np.arange(N) < N - 40, source.copy(), source.copy()
     junk[~valid], dirty[~valid] = 50, np.nan
@@ -395,7 +196,7 @@ def test_masked_and_non_finite_rows_do_not_count():
 
 
 def test_statuses():
-    source, target, _ = _pair(3)
+    source, target, _ = pair(3)
     key = jax.random.key(0)
     line = np.linspace(0, 1, N, dtype=np.float32)[:, None] * np.ones(3, np.float32)
 
@@ -442,6 +243,8 @@ def test_a_symmetric_object_is_ambiguous_and_its_modes_are_the_symmetrys(shape):
 
 
 CUBE = np.ones((5, 3), np.float32)
+
+
 TWO = {"target": [CUBE] * 2}
 
 
@@ -474,7 +277,7 @@ TWO = {"target": [CUBE] * 2}
     ],
 )
 def test_wrong_arguments_are_named(change, error, words):
-    source, target, _ = _pair(3)
+    source, target, _ = pair(3)
     arguments = {
         "source": source,
         "target": target,
@@ -493,13 +296,13 @@ def test_counts_that_leave_nothing_to_do_are_refused(field):
 
 def test_integer_points_lists_and_the_older_keys_are_taken():
     square = [[0, 0], [4, 0], [4, 1], [0, 2], [1, 3], [3, 2]]
-    sol = jr.register(square, square, _Centroids(), key=jax.random.PRNGKey(0))
+    sol = jr.register(square, square, Centroids(), key=jax.random.PRNGKey(0))
     np.testing.assert_allclose(sol.T_target_source, np.eye(3), atol=1e-6)
     assert sol.T_target_source.dtype == jnp.float32
 
 
 def test_repr_is_one_line():
-    source, target, T = _pair(3, 3, angle=0.3)
+    source, target, T = pair(3, 3, angle=0.3)
     text = repr(jr.register(source, target, jr.ICP(), init=T))
     assert "CONVERGED" in text
     assert "\n" not in text
