@@ -115,6 +115,13 @@ def learning2sync(path: Path) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
     return graph, np.linalg.inv(T_view_world), np.ones(num, bool)
 
 
+def log(path: Path) -> PoseGraph:
+    """A Redwood log with its rotations on the group: OpenCV's are off by up to 0.1."""
+    rows = np.array(path.read_text().split(), dtype=np.float64).reshape(-1, 19)
+    T_i_j = on_group(rows[:, 3:].reshape(-1, 4, 4)).astype(np.float32)
+    return PoseGraph.from_edges(rows[:, :2].astype(int), T_i_j, int(rows[0, 2]))
+
+
 def chained(logs: list[Path]) -> tuple[np.ndarray, np.ndarray]:
     """True poses along the true pairs, and the frames of the largest component."""
     parts = [read_log(path) for path in logs if path.exists()]

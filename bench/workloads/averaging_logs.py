@@ -15,6 +15,7 @@ from bench.records import Metric
 from bench.workloads.averaging_data import (
     chained,
     learning2sync,
+    log,
     on_group,
 )
 from bench.workloads.local_pairs import written_out
@@ -27,7 +28,6 @@ from jaxreg.averaging import (
     average,
 )
 from jaxreg.graph import PoseGraph
-from jaxreg.io import read_log
 
 
 METHODS: dict[str, AbstractAverager] = {
@@ -71,7 +71,7 @@ def _logs(root: Path) -> list[Scene]:
             [path.parent / "gt.log", path.parent / "3dlomatch_gt.log"]
         )
         # One shape for all logs: one compilation for each number of fragments.
-        scenes.append((read_log(path).padded(800), T_true, known))
+        scenes.append((log(path).padded(800), T_true, known))
     return scenes
 
 
