@@ -116,7 +116,10 @@ def with_false_closures(clean: PoseGraph, share: float, seed: int) -> Trial:
 
 def odometry(graph: PoseGraph) -> np.ndarray:
     """Poses along the edges between successive frames."""
-    return np.asarray(along_frames(graph), float)
+    return np.asarray(_along_frames(graph), float)
+
+
+_along_frames = jax.jit(along_frames)
 
 
 def methods(graph: str, clean: PoseGraph) -> list[Method]:
@@ -132,7 +135,7 @@ def methods(graph: str, clean: PoseGraph) -> list[Method]:
     ]
     optimum = PoseGraphLM(objective="chordal")
     return [
-        Method("odometry", "numpy", "successive edges chained", _odometry),
+        Method("odometry", "jaxreg", "successive edges chained", _odometry),
         *own,
         *peers,
         Method(
