@@ -56,6 +56,7 @@ def align_poses(
     return lie.compose(lie.rotation(moved), lie.translation(moved) + shift)
 
 
+@compiled
 def rotation_errors(
     T_world_i: Float[Array, "v D D"],
     T_true_i: Float[Array, "v D D"],
@@ -68,6 +69,7 @@ def rotation_errors(
     return lie.rotation_angle(R)
 
 
+@compiled
 def translation_errors(
     T_world_i: Float[Array, "v D D"],
     T_true_i: Float[Array, "v D D"],

@@ -49,6 +49,7 @@ class RelativeMotions(BriefModule):
         parts = self.T_i_j, self.overlap, self.inlier_rmse
         return RelativeMotions(self.pairs, *(x[e, mode][:, None] for x in parts))
 
+    @compiled
     def rows(self, rows: Int[Array, " r"]) -> "RelativeMotions":
         """Some of them."""
         return jax.tree.map(lambda x: x[rows], self)
