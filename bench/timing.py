@@ -6,6 +6,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -116,3 +117,13 @@ def keep(rows: list[dict], common: dict, path: Path | None) -> None:
     if path is not None:
         with path.open("a", encoding="utf-8") as file:
             file.writelines(json.dumps(row | common) + "\n" for row in rows)
+
+
+def within(seconds: float, function: Callable[..., Any], *args: Any) -> Any:
+    """What a call gives in a process of its own, which is ended after so long."""
+    with get_context("spawn").Pool(1) as pool:
+        answer = pool.apply_async(function, args)
+        answer.wait(seconds)
+        if not answer.ready():
+            raise TimeoutError(f"no answer in {seconds:g} s")
+        return answer.get()
