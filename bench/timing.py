@@ -59,7 +59,7 @@ def in_turn(
         try:
             return timed(lambda: methods[name](*case))
         except Exception as err:  # another version of a peer, or out of memory
-            failed[name] = f"failed: {str(err) or type(err).__name__}"
+            failed[name] = str(err) or type(err).__name__
             calls.pop(name, None)
             return None
 
