@@ -8,7 +8,7 @@ import numpy as np
 
 import jaxreg
 from jaxreg.datasets import sculpture_scans
-from jaxreg.io.stanford import read_conf
+from jaxreg.io.poses.stanford import read_conf
 from jaxreg.multiview import reconstruct
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from bench import trial_plot
 from bench.records import Row
 from bench.trajectories import trajectories
+from jaxreg.app.plot.figure import new_figure
 from jaxreg.io.atomic import atomic_write
-from jaxreg.plot.figure import new_figure
 
 
 # Colours that people who confuse red and green tell apart; the first for jaxreg.

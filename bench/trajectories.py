@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image
 
 from bench.records import Row
+from jaxreg.app.plot.figure import new_figure
 from jaxreg.io.atomic import atomic_write
-from jaxreg.plot.figure import new_figure
 
 
 _PATH, _CLEAN, _FALSE = "#1f4e79", "#c9c9c9", "#d1495b"

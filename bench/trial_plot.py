@@ -8,8 +8,8 @@ import numpy as np
 
 from bench.records import Row
 from bench.workloads.filter_data import EXPERIMENTS, moved
+from jaxreg.app.plot.figure import new_figure, tilt
 from jaxreg.io.atomic import atomic_write
-from jaxreg.plot.figure import new_figure, tilt
 
 
 _TARGET, _SOURCE = "#b4bac2", "#c1272d"

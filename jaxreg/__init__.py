@@ -75,12 +75,10 @@ from jaxreg.local import ClosedForm as ClosedForm
 from jaxreg.local import GaussNewton as GaussNewton
 from jaxreg.local import GradientDescent as GradientDescent
 from jaxreg.local import LevenbergMarquardt as LevenbergMarquardt
-from jaxreg.local import PlaneToPlane as PlaneToPlane
-from jaxreg.local import PointToPlane as PointToPlane
-from jaxreg.local import PointToPoint as PointToPoint
-from jaxreg.local import RegistrationSolution as RegistrationSolution
-from jaxreg.local import SearchTrace as SearchTrace
-from jaxreg.local import Symmetric as Symmetric
+from jaxreg.matching import PlaneToPlane as PlaneToPlane
+from jaxreg.matching import PointToPlane as PointToPlane
+from jaxreg.matching import PointToPoint as PointToPoint
+from jaxreg.matching import Symmetric as Symmetric
 from jaxreg.multiview import ReconstructionSolution as ReconstructionSolution
 from jaxreg.multiview import RelativeMotions as RelativeMotions
 from jaxreg.multiview import reconstruct as reconstruct
@@ -92,6 +90,8 @@ from jaxreg.neighbours import correspondences as correspondences
 from jaxreg.particle import MultiStart as MultiStart
 from jaxreg.particle import ParticleFilter as ParticleFilter
 from jaxreg.particle import sandhu2010 as sandhu2010
+from jaxreg.registrar import RegistrationSolution as RegistrationSolution
+from jaxreg.registrar import SearchTrace as SearchTrace
 from jaxreg.registration import register as register
 
 

@@ -1,6 +1,6 @@
 """`python -m jaxreg` is the command `jaxreg`."""
 
-from jaxreg.cli.main import command
+from jaxreg.app.cli.main import command
 
 
 if __name__ == "__main__":

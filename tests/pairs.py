@@ -7,7 +7,7 @@ from helpers import blob, motion, move
 
 import jaxreg as jr
 from jaxreg.cloud import PointCloud
-from jaxreg.local import AbstractRegistrar, Modes, RegistrationSolution
+from jaxreg.registrar import AbstractRegistrar, Modes, RegistrationSolution
 from jaxreg.robust import L2
 
 

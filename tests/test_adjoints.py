@@ -10,7 +10,7 @@ from helpers import blob, motion, move, switched_on
 from protocols import graph, measured
 
 import jaxreg as jr
-from jaxreg.averaging.implicit import DENSE_UNKNOWNS
+from jaxreg.averaging.steps.implicit import DENSE_UNKNOWNS
 from jaxreg.cloud import PointCloud, estimate_normals
 from jaxreg.geometry.kabsch import kabsch
 from jaxreg.robust import L2, Cauchy, Tukey

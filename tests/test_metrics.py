@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from jaxreg import metrics
 from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
-from jaxreg.io.g2o import read_g2o
+from jaxreg.io.graphs.g2o import read_g2o
 from tests.helpers import data_dir
 
 

@@ -29,8 +29,8 @@ from protocols import (
 import jaxreg as jr
 from jaxreg._core import compile as compile_module
 from jaxreg.averaging import AbstractAverager
-from jaxreg.local import AbstractRegistrar
 from jaxreg.neighbours import AbstractIndex
+from jaxreg.registrar import AbstractRegistrar
 
 
 STEP = 2e-6

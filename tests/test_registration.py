@@ -15,7 +15,7 @@ from pairs import BESL_MCKAY, FILTER, Centroids, M, N, pair
 import jaxreg as jr
 from jaxreg import Status
 from jaxreg.datasets import sculpture_scans
-from jaxreg.local import AbstractRegistrar
+from jaxreg.registrar import AbstractRegistrar
 from jaxreg.robust import L1
 
 

@@ -22,7 +22,7 @@ from bench.case import Case, Judged, Method, Options
 from bench.motion_scans import SETS
 from bench.records import Metric, error
 from jaxreg.graph import PoseGraph
-from jaxreg.io.g2o import read_g2o, read_g2o_poses
+from jaxreg.io.graphs.g2o import read_g2o, read_g2o_poses
 from jaxreg.metrics import chordal_objective
 
 

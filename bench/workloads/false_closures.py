@@ -17,6 +17,7 @@ from bench.peers.pose_graphs import Found, robust
 from bench.records import Metric, error
 from bench.timing import within
 from bench.workloads.local_pairs import written_out
+from jaxreg.app.plot.figure import principal_axes, tilt
 from jaxreg.averaging import (
     AbstractAverager,
     Correntropy,
@@ -24,16 +25,15 @@ from jaxreg.averaging import (
     PoseGraphLM,
     average,
 )
-from jaxreg.averaging.tree import along_frames
 from jaxreg.graph import PoseGraph
-from jaxreg.io.g2o import read_g2o
+from jaxreg.graph.trees import along_frames
+from jaxreg.io.graphs.g2o import read_g2o
 from jaxreg.metrics import (
     align_poses,
     chordal_objective,
     rotation_errors,
     translation_errors,
 )
-from jaxreg.plot.figure import principal_axes, tilt
 
 
 GRAPHS, SHARES, SEEDS = ("parking-garage", "intel"), (0.1, 0.3), 3

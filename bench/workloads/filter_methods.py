@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from bench.workloads.filter_data import Trials
 from jaxreg import KernelCorrelation
-from jaxreg.local import AbstractRegistrar
 from jaxreg.particle import (
     ConstantVelocity,
     GaussianPrior,
@@ -21,6 +20,7 @@ from jaxreg.particle import (
     StochasticDynamics,
     sandhu2010,
 )
+from jaxreg.registrar import AbstractRegistrar
 
 
 class Tried(NamedTuple):

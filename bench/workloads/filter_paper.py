@@ -26,7 +26,7 @@ from bench.workloads.global_horse import SEED, prepared
 from bench.workloads.local_pairs import written_out
 from bench.workloads.prepared_model import ours, with_l1
 from jaxreg import register
-from jaxreg.local import AbstractRegistrar
+from jaxreg.registrar import AbstractRegistrar
 
 
 TRIALS = 100

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.workloads.filter_data import Trials
-from jaxreg.io.stanford import read_conf
+from jaxreg.io.poses.stanford import read_conf
 
 
 SCAN_SETS = {

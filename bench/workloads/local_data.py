@@ -8,7 +8,7 @@ import numpy as np
 from bench.case import Judged
 from bench.records import Metric, error, share
 from jaxreg.datasets import sculpture_scans
-from jaxreg.io.stanford import read_conf
+from jaxreg.io.poses.stanford import read_conf
 
 
 class Draw(NamedTuple):

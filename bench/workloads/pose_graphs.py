@@ -19,7 +19,7 @@ from jaxreg.averaging import (
     average,
 )
 from jaxreg.graph import PoseGraph
-from jaxreg.io.g2o import read_g2o
+from jaxreg.io.graphs.g2o import read_g2o
 from jaxreg.metrics import chordal_objective
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from jaxreg._core.compile import compiled
 from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.geometry import lie
-from jaxreg.local import PointToPoint
+from jaxreg.matching import PointToPoint
 from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
 from jaxreg.particle import (
     AbsoluteEnergy,

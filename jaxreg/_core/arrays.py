@@ -1,4 +1,4 @@
-"""Fields of method objects: traced numbers, static structure."""
+"""Fields of method objects, traced numbers and static structure; rows of arrays."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Int
 
 
 Tree = TypeVar("Tree")
@@ -45,3 +45,19 @@ def on_both(function: Callable[[Tree], Out], a: Tree, b: Tree) -> tuple[Out, Out
         return function(a), function(b)
     out = lax.map(function, jax.tree.map(lambda *x: jnp.stack(x), a, b))
     return jax.tree.map(lambda x: x[0], out), jax.tree.map(lambda x: x[1], out)
+
+
+def spread_rows(
+    mask: Bool[Array, " n"], num: int
+) -> tuple[Int[Array, " r"], Bool[Array, " r"]]:
+    """At most `num` valid rows, evenly spread, and which of them are in use.
+
+    The same for any number of masked rows.
+    """
+    num = min(num, mask.shape[0])
+    count = jnp.cumsum(mask.astype(jnp.int32))
+    at, used = jnp.arange(num, dtype=jnp.int32), jnp.minimum(count[-1], num)
+    # The valid row of that rank; searched, not sorted.
+    rank = at * (count[-1] - 1) // jnp.maximum(used - 1, 1)
+    row = jnp.searchsorted(count, rank + 1).astype(jnp.int32)
+    return jnp.minimum(row, len(mask) - 1), at < used

@@ -5,9 +5,9 @@ from typing import overload
 
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
-from jaxreg.averaging.correntropy import Correntropy
 from jaxreg.averaging.gauge import average_graph
 from jaxreg.averaging.many import average_list, check_graph, check_init
+from jaxreg.averaging.methods.correntropy import Correntropy
 from jaxreg.graph.pose_graph import PoseGraph
 
 

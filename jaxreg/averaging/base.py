@@ -2,13 +2,13 @@
 
 import abc
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import is_concrete
-from jaxreg._core.solution import Solution
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, StatusArray
 from jaxreg.averaging.trace import AveragingTrace
@@ -16,7 +16,7 @@ from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 
 
-class AveragingSolution(Solution):
+class AveragingSolution(eqx.Module):
     """One pose per frame. Arrays only: it passes through jit, vmap and pickling.
 
     Attributes:
@@ -164,3 +164,13 @@ def solution(
         length_scale=scale,
         trace=trace,
     )
+
+
+def start(
+    initialiser: AbstractAverager,
+    graph: PoseGraph,
+    init: Float[Array, "v D D"] | None,
+    key: Key | None,
+) -> Float[Array, "v D D"]:
+    """The poses to start from: `init`, or what the initialiser finds."""
+    return initialiser.solve(graph, None, key).T_world_i if init is None else init

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.compile import compiled
 from jaxreg.averaging.base import AveragingSolution
-from jaxreg.averaging.gauss_newton import normal_equations, precisions
+from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 

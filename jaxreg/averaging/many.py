@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.checks import as_float_array, is_concrete
 from jaxreg._core.compile import compiled
-from jaxreg._core.padding import rounded_up, stacked
-from jaxreg._core.progress import tell
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
+from jaxreg.batching.padding import rounded_up, stacked
+from jaxreg.batching.progress import tell
 from jaxreg.graph.pose_graph import PoseGraph
 
 

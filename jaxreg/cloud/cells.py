@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxreg._core.sorting import rows_in_order
 from jaxreg._core.typing import Mask, Points, Scalar
+from jaxreg.neighbours.sorting import rows_in_order
 
 
 UNUSED = jnp.iinfo(jnp.int32).max

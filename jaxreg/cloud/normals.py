@@ -15,10 +15,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.sorting import rows_in_order
 from jaxreg._core.typing import Scalar
 from jaxreg.cloud.cells import UNUSED, bits_per_axis, morton_keys
 from jaxreg.geometry.eigen import least_eigenvectors
+from jaxreg.neighbours.sorting import rows_in_order
 
 
 # Windows are made of cells of at last 8 times the size that keys were made with.

@@ -15,17 +15,10 @@ from jaxreg.cloud import PointCloud, median_spacing, thin, without_noise
 from jaxreg.correlation.ascent import ascend, is_free, newton_step
 from jaxreg.correlation.quadratic import Quadratic, pull_on_target
 from jaxreg.geometry import lie
-from jaxreg.local import (
-    AbstractRegistrar,
-    Modes,
-    RegistrationSolution,
-    Score,
-    mutual_overlap,
-    sandwich,
-    score_both_ways,
-    turn_and_shift,
-)
+from jaxreg.local import sandwich, turn_and_shift
+from jaxreg.matching import Score, mutual_overlap, score_both_ways
 from jaxreg.neighbours import exact_index
+from jaxreg.registrar import AbstractRegistrar, Modes, RegistrationSolution
 
 
 # The bandwidth where none is given, in root mean square radii of the target and, where

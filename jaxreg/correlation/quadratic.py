@@ -16,7 +16,7 @@ from jaxreg._core.typing import Motion
 from jaxreg.cloud import PointCloud
 from jaxreg.correlation.pairs import PairSums, pair_sums
 from jaxreg.geometry import lie
-from jaxreg.local.residuals.gram import cross
+from jaxreg.matching.residuals.gram import cross
 
 
 class Quadratic(eqx.Module):

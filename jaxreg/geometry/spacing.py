@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxreg._core.padding import spread_rows
+from jaxreg._core.arrays import spread_rows
 from jaxreg._core.typing import Mask, Points
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import product
+from jaxreg.graph.pose_graph import PoseGraph, product
 
 
 class Forest(eqx.Module):
@@ -235,3 +235,19 @@ def ancestors(parent: Int[Array, " v"]) -> Bool[Array, "v v"]:
     for _ in range(max(num - 1, 1).bit_length()):
         above, parent = above | above[parent], parent[parent]
     return above
+
+
+def along_frames(graph: PoseGraph) -> Float[Array, "v D D"]:
+    """Poses along the edges between successive frames, and others where none is.
+
+    Large graphs are sequences as a rule, and a recording seldom slips between one
+    frame and the next, while closures of loops may be false.
+    """
+    usual = jnp.max(graph.weight)
+    successive = jnp.abs(graph.edges[:, 0] - graph.edges[:, 1]) == 1
+    weight = jnp.where(
+        (graph.weight > 0) & successive, graph.weight + usual, graph.weight
+    )
+    return maximum_spanning_tree(
+        graph.edges, graph.T_i_j, weight, graph.num_poses
+    ).T_world_i

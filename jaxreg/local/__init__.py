@@ -1,29 +1,10 @@
 """Local registration: one algorithm, ICP, assembled from parts."""
 
-from jaxreg.local.base import AbstractRegistrar as AbstractRegistrar
-from jaxreg.local.base import Modes as Modes
-from jaxreg.local.base import RegistrationSolution as RegistrationSolution
 from jaxreg.local.curvature import Curvature as Curvature
 from jaxreg.local.curvature import sandwich as sandwich
 from jaxreg.local.curvature import tangent_unit as tangent_unit
 from jaxreg.local.icp import ICP as ICP
 from jaxreg.local.optimiser import LocalOptimiser as LocalOptimiser
-from jaxreg.local.problem import Match as Match
-from jaxreg.local.problem import Problem as Problem
-from jaxreg.local.problem import match as match
-from jaxreg.local.problem import moved as moved
-from jaxreg.local.residuals import AbstractResidual as AbstractResidual
-from jaxreg.local.residuals import PlaneToPlane as PlaneToPlane
-from jaxreg.local.residuals import PointToPlane as PointToPlane
-from jaxreg.local.residuals import PointToPoint as PointToPoint
-from jaxreg.local.residuals import Symmetric as Symmetric
-from jaxreg.local.score import Score as Score
-from jaxreg.local.score import agreeing as agreeing
-from jaxreg.local.score import mutual_overlap as mutual_overlap
-from jaxreg.local.score import score as score
-from jaxreg.local.score import score_both_ways as score_both_ways
-from jaxreg.local.slippage import Grip as Grip
-from jaxreg.local.slippage import can_slip as can_slip
 from jaxreg.local.steps import AbstractStep as AbstractStep
 from jaxreg.local.steps import ClosedForm as ClosedForm
 from jaxreg.local.steps import GaussNewton as GaussNewton
@@ -33,4 +14,3 @@ from jaxreg.local.steps import condition as condition
 from jaxreg.local.steps import decoupled_error as decoupled_error
 from jaxreg.local.steps import gyration_radius as gyration_radius
 from jaxreg.local.steps import turn_and_shift as turn_and_shift
-from jaxreg.local.trace import SearchTrace as SearchTrace

@@ -8,12 +8,12 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Motion
 from jaxreg.local.optimiser import LocalOptimiser
-from jaxreg.local.problem import Match, Problem, match, sum_rows
-from jaxreg.local.residuals import AbstractResidual, PointToPlane, PointToPoint
-from jaxreg.local.residuals.gram import along
 from jaxreg.local.steps import condition, gyration_radius
 from jaxreg.local.steps.base import full_matmul
 from jaxreg.local.steps.tiny_solve import solve_semidefinite
+from jaxreg.matching.problem import Match, Problem, match, sum_rows
+from jaxreg.matching.residuals import AbstractResidual, PointToPlane, PointToPoint
+from jaxreg.matching.residuals.gram import along
 
 
 # Least over largest curvature of the energy below which a direction of the motion is

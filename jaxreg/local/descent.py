@@ -13,9 +13,9 @@ from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
 from jaxreg.geometry.kabsch import nearest_rotation
 from jaxreg.local.optimiser import LocalOptimiser
-from jaxreg.local.problem import Match, Problem, match
 from jaxreg.local.scale import fit_scale
 from jaxreg.local.steps import decoupled_error
+from jaxreg.matching.problem import Match, Problem, match
 
 
 # A descent begins with every so-many-th point, while it still takes large steps.

@@ -12,8 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.adjoint import AbstractAdjoint, ImplicitAdjoint
-from jaxreg._core.arrays import cast_floats, traced
-from jaxreg._core.padding import spread_rows
+from jaxreg._core.arrays import cast_floats, spread_rows, traced
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import (
@@ -24,16 +23,16 @@ from jaxreg.cloud import (
     without_noise,
 )
 from jaxreg.geometry import lie
-from jaxreg.local.base import AbstractRegistrar, Modes, RegistrationSolution
 from jaxreg.local.curvature import Curvature, is_degenerate
 from jaxreg.local.descent import Descent, Limits, descend
 from jaxreg.local.implicit import stationary
 from jaxreg.local.optimiser import LocalOptimiser
-from jaxreg.local.problem import Match, Problem, match
-from jaxreg.local.residuals import AbstractResidual, PlaneToPlane
-from jaxreg.local.score import Score, mutual_overlap, score, score_match
 from jaxreg.local.steps import AbstractStep, GaussNewton
+from jaxreg.matching.problem import Match, Problem, match
+from jaxreg.matching.residuals import AbstractResidual, PlaneToPlane
+from jaxreg.matching.score import Score, mutual_overlap, score, score_match
 from jaxreg.neighbours import AbstractIndex, BruteForce, index_within
+from jaxreg.registrar.base import AbstractRegistrar, Modes, RegistrationSolution
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
 

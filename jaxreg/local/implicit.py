@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.local.descent import Descent, Limits
 from jaxreg.local.optimiser import LocalOptimiser
-from jaxreg.local.problem import Problem, match
 from jaxreg.local.steps import turn_and_shift
 from jaxreg.local.steps.base import full_matmul
+from jaxreg.matching.problem import Problem, match
 
 
 # Singular values below this share of the largest, in units of rounding, are free.

@@ -5,9 +5,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Motion
-from jaxreg.local.problem import Match, Problem, match
-from jaxreg.local.residuals import AbstractResidual
 from jaxreg.local.steps import AbstractStep
+from jaxreg.matching.problem import Match, Problem, match
+from jaxreg.matching.residuals import AbstractResidual
 from jaxreg.robust import AbstractKernel
 
 

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.local.problem import Match
-from jaxreg.local.residuals import AbstractResidual
 from jaxreg.local.steps.tiny_solve import solve_semidefinite
+from jaxreg.matching.problem import Match
+from jaxreg.matching.residuals import AbstractResidual
 
 
 # A factor in one step at most; far from the solution matches shrink the source.

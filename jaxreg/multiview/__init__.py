@@ -1,5 +1,5 @@
 """Many scans into one frame."""
 
 from jaxreg.multiview.reconstruct import reconstruct as reconstruct
-from jaxreg.multiview.relative import RelativeMotions as RelativeMotions
+from jaxreg.multiview.relative_motions import RelativeMotions as RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution as ReconstructionSolution

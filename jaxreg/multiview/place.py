@@ -18,7 +18,7 @@ from jaxreg.averaging import (
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import components
-from jaxreg.multiview.relative import RelativeMotions
+from jaxreg.multiview.relative_motions import RelativeMotions
 
 
 # An edge whose residual leaves it less trust than this joins no scans.

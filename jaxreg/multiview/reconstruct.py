@@ -14,13 +14,13 @@ import numpy as np
 from jaxreg._core.checks import check_key, is_concrete
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
-from jaxreg.multiview.finish import finish
-from jaxreg.multiview.hold import Held
-from jaxreg.multiview.inputs import checked_viewpoints, padded_scans
-from jaxreg.multiview.plan import Order, all_pairs, first_pairs
-from jaxreg.multiview.relative import RelativeMotions, relative_motions
-from jaxreg.multiview.rounds import OnPairs, Rounds
-from jaxreg.multiview.scans import PreparedScans, prepare_scans
+from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
+from jaxreg.multiview.choose_pairs import Order, all_pairs, first_pairs
+from jaxreg.multiview.conclude import finish
+from jaxreg.multiview.hold_poses import Held
+from jaxreg.multiview.prepare import PreparedScans, prepare_scans
+from jaxreg.multiview.register_pairs import OnPairs, Rounds
+from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.particle import ParticleFilter
 

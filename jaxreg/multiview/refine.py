@@ -18,17 +18,11 @@ from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import AbstractAverager, Correntropy, SpanningTree
 from jaxreg.geometry import lie
-from jaxreg.local import (
-    GaussNewton,
-    LocalOptimiser,
-    PlaneToPlane,
-    Problem,
-    mutual_overlap,
-    score,
-)
+from jaxreg.local import GaussNewton, LocalOptimiser
+from jaxreg.matching import PlaneToPlane, Problem, mutual_overlap, score
 from jaxreg.multiview.place import Placement, part_sizes, place
-from jaxreg.multiview.relative import RelativeMotions
-from jaxreg.multiview.scans import PreparedScans
+from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.neighbours import exact_index
 from jaxreg.robust import GemanMcClure
 

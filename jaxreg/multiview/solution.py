@@ -7,15 +7,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import is_concrete
-from jaxreg._core.solution import Solution
 from jaxreg._core.status import Status
 from jaxreg._core.typing import StatusArray
 from jaxreg.averaging import AveragingTrace
 from jaxreg.graph import PoseGraph
-from jaxreg.multiview.relative import RelativeMotions
+from jaxreg.multiview.relative_motions import RelativeMotions
 
 
-class ReconstructionSolution(Solution):
+class ReconstructionSolution(eqx.Module):
     """One pose per scan, and every pair that was tried.
 
     Attributes:

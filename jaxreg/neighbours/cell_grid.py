@@ -16,11 +16,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.padding import spread_rows
-from jaxreg._core.sorting import rows_in_order
+from jaxreg._core.arrays import spread_rows
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.geometry.spacing import median_spacing
 from jaxreg.neighbours.base import AbstractIndex, Neighbours, in_tiles, map_first
+from jaxreg.neighbours.sorting import rows_in_order
 from jaxreg.neighbours.voxel_table import VoxelTable
 
 

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from jaxreg._core.sorting import rows_in_order
 from jaxreg._core.typing import Mask, Points
 from jaxreg.geometry.boxes import bounding_cube
+from jaxreg.neighbours.sorting import rows_in_order
 
 
 def hilbert_order(points: Points, mask: Mask) -> Int[Array, " n"]:

@@ -15,19 +15,13 @@ from jaxreg._core.arrays import cast_floats, on_both
 from jaxreg._core.checks import check_key, is_concrete
 from jaxreg._core.typing import Key, Mask, Motion, Points
 from jaxreg.cloud import PointCloud, levelled, thin, without_noise
-from jaxreg.local import (
-    AbstractRegistrar,
-    AbstractResidual,
-    AbstractStep,
-    LocalOptimiser,
-    Problem,
-    RegistrationSolution,
-    SearchTrace,
-)
+from jaxreg.local import AbstractStep, LocalOptimiser
+from jaxreg.matching import AbstractResidual, Problem
 from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
 from jaxreg.particle.conclude import Pair, conclude
 from jaxreg.particle.priors import AbstractPrior, GaussianPrior, UniformPrior
 from jaxreg.particle.state import Particles
+from jaxreg.registrar import AbstractRegistrar, RegistrationSolution, SearchTrace
 from jaxreg.robust import AbstractKernel
 
 

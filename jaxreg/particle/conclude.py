@@ -14,15 +14,11 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import PointCloud, levelled, median_spacing
 from jaxreg.geometry import lie
-from jaxreg.local import (
-    Curvature,
-    GaussNewton,
-    LocalOptimiser,
-    Modes,
+from jaxreg.local import Curvature, GaussNewton, LocalOptimiser
+from jaxreg.matching import (
     PlaneToPlane,
     PointToPlane,
     Problem,
-    RegistrationSolution,
     Score,
     can_slip,
     match,
@@ -32,6 +28,7 @@ from jaxreg.local import (
 from jaxreg.neighbours import AbstractIndex
 from jaxreg.particle.modes import distinct_modes, first_within
 from jaxreg.particle.state import Particles
+from jaxreg.registrar import Modes, RegistrationSolution
 from jaxreg.robust import AbstractKernel
 
 

@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
-from jaxreg.local import LocalOptimiser, Problem
+from jaxreg.local import LocalOptimiser
+from jaxreg.matching import Problem
 from jaxreg.particle.energies import AbstractEnergy
 from jaxreg.particle.measure import measure
 from jaxreg.particle.state import Particles

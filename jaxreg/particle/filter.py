@@ -27,15 +27,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.typing import Key, Motion, Scalar
-from jaxreg.local import (
-    AbstractResidual,
-    AbstractStep,
-    GaussNewton,
-    LocalOptimiser,
-    PointToPlane,
-    Problem,
-    SearchTrace,
-)
+from jaxreg.local import AbstractStep, GaussNewton, LocalOptimiser
+from jaxreg.matching import AbstractResidual, PointToPlane, Problem
 from jaxreg.particle.base import AbstractSearch, Found, check_counts, check_positive
 from jaxreg.particle.draw import (
     SETTLE_STEPS,
@@ -51,6 +44,7 @@ from jaxreg.particle.resamplers import AbstractResampler, Systematic
 from jaxreg.particle.state import Particles
 from jaxreg.particle.trace import no_rows, with_row
 from jaxreg.particle.weights import log_likelihood, normalised
+from jaxreg.registrar import SearchTrace
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
 

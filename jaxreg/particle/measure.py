@@ -7,7 +7,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.typing import Scalar
-from jaxreg.local import LocalOptimiser, Problem, decoupled_error, match
+from jaxreg.local import LocalOptimiser, decoupled_error
+from jaxreg.matching import Problem, match
 from jaxreg.particle.energies import AbstractEnergy
 from jaxreg.particle.state import Particles
 

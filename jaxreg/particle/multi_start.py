@@ -8,15 +8,8 @@ from jaxtyping import Array
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key, Motion
-from jaxreg.local import (
-    AbstractResidual,
-    AbstractStep,
-    GaussNewton,
-    PointToPlane,
-    Problem,
-    decoupled_error,
-    match,
-)
+from jaxreg.local import AbstractStep, GaussNewton, decoupled_error
+from jaxreg.matching import AbstractResidual, PointToPlane, Problem, match
 from jaxreg.particle.base import AbstractSearch, Found, check_counts, check_positive
 from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy
 from jaxreg.particle.priors import AbstractPrior, GivenParticles

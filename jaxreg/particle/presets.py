@@ -1,6 +1,7 @@
 """Settings of papers."""
 
-from jaxreg.local import GaussNewton, GradientDescent, PointToPoint
+from jaxreg.local import GaussNewton, GradientDescent
+from jaxreg.matching import PointToPoint
 from jaxreg.particle.dynamics import AbstractDynamics, StochasticDynamics
 from jaxreg.particle.energies import SquaredEnergy
 from jaxreg.particle.filter import ParticleFilter

@@ -5,9 +5,9 @@ from jax import lax
 
 from jaxreg._core.quantile import masked_quantile
 from jaxreg._core.typing import Scalar
-from jaxreg.local import SearchTrace
 from jaxreg.particle.state import Particles
 from jaxreg.particle.weights import effective_sample_size
+from jaxreg.registrar import SearchTrace
 
 
 def no_rows(num: int, dtype: jnp.dtype) -> SearchTrace:

@@ -14,17 +14,14 @@ from jaxreg._core.checks import (
     is_concrete,
 )
 from jaxreg._core.compile import compiled
-from jaxreg._core.padding import (
+from jaxreg._core.typing import Progress
+from jaxreg.batching.padding import (
     rounded_up,
     stacked,
 )
-from jaxreg._core.progress import tell
-from jaxreg._core.threads import map_in_threads, num_cores
-from jaxreg._core.typing import Progress
-from jaxreg.local import (
-    AbstractRegistrar,
-    RegistrationSolution,
-)
+from jaxreg.batching.progress import tell
+from jaxreg.batching.threads import map_in_threads, num_cores
+from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
 from jaxreg.registration.pair import register_pair
 
 

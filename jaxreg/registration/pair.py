@@ -13,13 +13,8 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import centroid, rms_radius
 from jaxreg.geometry import lie
-from jaxreg.local import (
-    AbstractRegistrar,
-    Curvature,
-    Modes,
-    RegistrationSolution,
-    tangent_unit,
-)
+from jaxreg.local import Curvature, tangent_unit
+from jaxreg.registrar import AbstractRegistrar, Modes, RegistrationSolution
 
 
 # Clouds are padded to one size where the larger is at most so many times as large.

@@ -11,18 +11,15 @@ from jaxreg._core.checks import (
     is_concrete,
 )
 from jaxreg._core.compile import compiled
-from jaxreg._core.padding import (
+from jaxreg._core.typing import Key, Progress
+from jaxreg.batching.padding import (
     check_lists,
     is_list_of_clouds,
     rounded_up,
     stacked,
 )
-from jaxreg._core.typing import Key, Progress
-from jaxreg.local import (
-    AbstractRegistrar,
-    RegistrationSolution,
-)
 from jaxreg.particle import ParticleFilter
+from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
 from jaxreg.registration.many import register_batch, register_lists
 from jaxreg.registration.pair import register_pair
 
@@ -87,8 +84,8 @@ def register(
         As the method says.
 
     Compilation:
-        Outside of a transformation clouds are padded to sizes rounded up (see
-        `rounded_up` in `jaxreg._core.padding`), those of a list to the one that holds
+        Outside of a transformation clouds are padded to sizes rounded up
+        (`jaxreg.batching.padding.rounded_up`), those of a list to the one that holds
         the largest, which changes an answer by rounding only: similar sizes share a
         program. Where a list would get more than 2^24 rows more, each pair of sizes
         compiles once.

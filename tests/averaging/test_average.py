@@ -13,9 +13,12 @@ from jaxreg.averaging import (
     WeightedMotionAveraging,
     average,
 )
-from jaxreg.averaging.gauss_newton import gauss_newton_gradients, gauss_newton_step
-from jaxreg.averaging.iterate import iterate
-from jaxreg.averaging.scales import gaussian_trust
+from jaxreg.averaging.steps.gauss_newton import (
+    gauss_newton_gradients,
+    gauss_newton_step,
+)
+from jaxreg.averaging.steps.iterate import iterate
+from jaxreg.averaging.steps.kernel_width import gaussian_trust
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_error, translation_error
 from tests.averaging.graphs import random_graph

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.averaging import CycleConsensus, PoseGraphLM, average
 from jaxreg.averaging.base import length_scale
-from jaxreg.averaging.cycles import NEUTRAL, edge_log_odds, judged
 from jaxreg.averaging.evidence import agreement, coherence
+from jaxreg.averaging.start.cycles import NEUTRAL, edge_log_odds, judged
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_error, rotation_errors
 from tests.averaging.graphs import (

@@ -4,9 +4,9 @@ import pytest
 
 from jaxreg import Status
 from jaxreg.averaging import average
-from jaxreg.averaging.laplacian import DENSE_LIMIT
 from jaxreg.graph import PoseGraph
 from jaxreg.io import read_g2o
+from jaxreg.linear.laplacian import DENSE_LIMIT
 from jaxreg.metrics import align_poses, chordal_objective, translation_errors
 from tests.averaging.graphs import motions, rotations
 from tests.helpers import data_dir

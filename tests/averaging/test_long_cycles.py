@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.averaging.cycles import NEUTRAL, edge_log_odds
-from jaxreg.averaging.long_cycles import long_cycle_odds
+from jaxreg.averaging.start.cycles import NEUTRAL, edge_log_odds
+from jaxreg.averaging.start.long_cycles import long_cycle_odds
 from jaxreg.graph import PoseGraph, trees
 from jaxreg.metrics import rotation_errors
 from tests.averaging.graphs import random_graph

@@ -10,7 +10,7 @@ import pytest
 from bench.case import Options
 from bench.workloads import command_line
 from jaxreg.graph import PoseGraph
-from jaxreg.io.g2o import read_g2o, write_g2o
+from jaxreg.io.graphs.g2o import read_g2o, write_g2o
 
 
 def test_a_command_starts_where_nothing_is_compiled(monkeypatch, tmp_path: Path):

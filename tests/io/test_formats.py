@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxreg.cli.main import main
+from jaxreg.app.cli.main import main
 from jaxreg.io import InputError, MissingExtraError, read_points, read_scans
-from jaxreg.io.points import read_named
+from jaxreg.io.points.read import read_named
 
 
 laspy = pytest.importorskip("laspy")
@@ -205,7 +205,7 @@ def test_of_large_scans_every_so_many_points_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ):
     for chunk in ("las._CHUNK", "e57._CHUNK", "thinning._ROWS"):
-        monkeypatch.setattr(f"jaxreg.io.{chunk}", 8)
+        monkeypatch.setattr(f"jaxreg.io.points.{chunk}", 8)
     suffix = kind if kind in ("las", "laz", "e57") else "pcd"
     path = tmp_path / f"a.{suffix}"
     if suffix == "pcd":
@@ -225,7 +225,7 @@ def test_of_large_scans_every_so_many_points_are_kept(
 def test_of_large_meshes_some_vertices_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ):
-    monkeypatch.setattr("jaxreg.io.meshes._LARGE", 1000)
+    monkeypatch.setattr("jaxreg.io.points.meshes._LARGE", 1000)
     ball = trimesh.creation.icosphere(2, 2.0)
     ball.faces = np.random.default_rng(0).permutation(ball.faces)
     path = tmp_path / f"a.{kind[:3]}"

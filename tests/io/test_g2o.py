@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxreg.graph import PoseGraph
 from jaxreg.io.errors import InputError
-from jaxreg.io.g2o import read_g2o, read_g2o_poses, write_g2o
+from jaxreg.io.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
 from tests.helpers import data_dir
 
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from jaxreg.io import InputError, read_points, read_scans, write_ply
-from jaxreg.io.points import read_named
-from jaxreg.io.text import parse_text
+from jaxreg.io.points.read import read_named
+from jaxreg.io.points.text import parse_text
 from tests.helpers import data_dir
 
 
@@ -211,8 +211,8 @@ def test_missing_file_folder_without_points_and_unnamed_scan(tmp_path: Path):
 def test_of_large_scans_every_so_many_points_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ):
-    monkeypatch.setattr("jaxreg.io.thinning._MOST_TEXT", 8_000)
-    monkeypatch.setattr("jaxreg.io.thinning._ROWS", 170)
+    monkeypatch.setattr("jaxreg.io.points.thinning._MOST_TEXT", 8_000)
+    monkeypatch.setattr("jaxreg.io.points.thinning._ROWS", 170)
     points = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
     path = tmp_path / f"scan{suffix}"
     if suffix == ".npy":

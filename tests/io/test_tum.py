@@ -3,8 +3,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.io.errors import InputError
+from jaxreg.io.poses.tum import read_tum, write_tum
 from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
-from jaxreg.io.tum import read_tum, write_tum
 
 
 def test_quaternions_agree_with_scipy_also_at_half_turns():

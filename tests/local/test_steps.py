@@ -15,18 +15,20 @@ from jaxreg.local import (
     GradientDescent,
     LevenbergMarquardt,
     LocalOptimiser,
+    condition,
+    decoupled_error,
+    gyration_radius,
+    turn_and_shift,
+)
+from jaxreg.local.steps.tiny_solve import solve_semidefinite
+from jaxreg.matching import (
     PlaneToPlane,
     PointToPlane,
     PointToPoint,
     Symmetric,
-    condition,
-    decoupled_error,
-    gyration_radius,
     match,
     moved,
-    turn_and_shift,
 )
-from jaxreg.local.steps.tiny_solve import solve_semidefinite
 from jaxreg.neighbours import BruteForce
 from jaxreg.robust import L2, Huber
 

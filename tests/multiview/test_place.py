@@ -5,8 +5,8 @@ import numpy as np
 from helpers import motion, pose_error
 
 from jaxreg.multiview import RelativeMotions
+from jaxreg.multiview.choose_pairs import all_pairs
 from jaxreg.multiview.place import place
-from jaxreg.multiview.plan import all_pairs
 
 
 T_TRUE = np.stack([motion(k, 3) for k in range(7)]).astype(np.float32)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from jaxreg.multiview.plan import all_pairs, first_pairs, most_pairs, next_pairs
+from jaxreg.multiview.choose_pairs import all_pairs, first_pairs, most_pairs, next_pairs
 
 
 RNG = np.random.default_rng(0)

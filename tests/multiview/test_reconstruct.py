@@ -11,7 +11,7 @@ import jaxreg as jr
 from jaxreg import Status
 from jaxreg.datasets import cube_points, sculpture_scans
 from jaxreg.multiview import RelativeMotions
-from jaxreg.multiview.inputs import padded_scans
+from jaxreg.multiview.check_scans import padded_scans
 
 
 FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64, max_points=1024)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import jaxreg as jr
-from jaxreg.local import Modes
+from jaxreg.registrar import Modes
 
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")

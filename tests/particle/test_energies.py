@@ -8,14 +8,8 @@ from helpers import blob, motion
 from scipy.spatial import KDTree
 
 from jaxreg.cloud import PointCloud
-from jaxreg.local import (
-    GaussNewton,
-    LocalOptimiser,
-    PointToPoint,
-    Problem,
-    decoupled_error,
-    match,
-)
+from jaxreg.local import GaussNewton, LocalOptimiser, decoupled_error
+from jaxreg.matching import PointToPoint, Problem, match
 from jaxreg.neighbours import BruteForce
 from jaxreg.particle import (
     AbsoluteEnergy,

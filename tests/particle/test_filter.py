@@ -14,7 +14,8 @@ from scipy.spatial import KDTree
 from jaxreg import Status
 from jaxreg._core.arrays import traced
 from jaxreg.cloud import PointCloud
-from jaxreg.local import LocalOptimiser, Problem, match
+from jaxreg.local import LocalOptimiser
+from jaxreg.matching import Problem, match
 from jaxreg.neighbours import BruteForce
 from jaxreg.particle import (
     AbsoluteEnergy,

@@ -27,7 +27,7 @@ from jaxreg._core.arrays import cast_floats
 from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.correlation.ascent import ascend
 from jaxreg.geometry import lie
-from jaxreg.local import Problem
+from jaxreg.matching import Problem
 from jaxreg.neighbours import VoxelTable
 from jaxreg.particle import (
     AbstractDynamics,

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Motion
 from jaxreg.geometry import lie
-from jaxreg.local.problem import Match
-from jaxreg.local.residuals import AbstractResidual
+from jaxreg.matching.problem import Match
+from jaxreg.matching.residuals import AbstractResidual
 
 
 class AbstractStep(BriefModule):

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Motion
-from jaxreg.local.problem import Match
-from jaxreg.local.residuals import AbstractResidual
 from jaxreg.local.steps.base import AbstractStep, turn_and_shift
 from jaxreg.local.steps.scaling import Scaled
+from jaxreg.matching.problem import Match
+from jaxreg.matching.residuals import AbstractResidual
 
 
 class GradientDescent(AbstractStep):

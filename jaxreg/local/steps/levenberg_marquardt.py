@@ -7,10 +7,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Motion
-from jaxreg.local.problem import Match, moved
-from jaxreg.local.residuals import AbstractResidual
 from jaxreg.local.steps.base import AbstractStep, turn_and_shift
 from jaxreg.local.steps.scaling import Scaled
+from jaxreg.matching.problem import Match, moved
+from jaxreg.matching.residuals import AbstractResidual
 
 
 class _Trial(eqx.Module):

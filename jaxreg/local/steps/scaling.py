@@ -9,9 +9,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.local.problem import Match, sum_rows
-from jaxreg.local.residuals.gram import half_sum
 from jaxreg.local.steps.tiny_solve import solve_semidefinite
+from jaxreg.matching.problem import Match, sum_rows
+from jaxreg.matching.residuals.gram import half_sum
 
 
 class Scaled(eqx.Module):

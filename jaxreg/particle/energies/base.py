@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Scalar
-from jaxreg.local import Match
+from jaxreg.matching import Match
 
 
 class AbstractEnergy(BriefModule):

@@ -7,7 +7,7 @@ from jaxtyping import Array
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Scalar
-from jaxreg.local import Match
+from jaxreg.matching import Match
 from jaxreg.particle.energies.base import AbstractEnergy
 
 

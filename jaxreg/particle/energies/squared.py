@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from jaxreg._core.typing import Scalar
-from jaxreg.local import Match
+from jaxreg.matching import Match
 from jaxreg.particle.energies.base import AbstractEnergy, mean_over_source
 
 

@@ -1,0 +1,1 @@
+"""What serves people: the command line, pictures, pages and results; extra `app`."""

@@ -1,0 +1,182 @@
+"""`jaxreg average`: poses from the relative motions of a g2o file."""
+
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+import tyro
+from rich.table import Table
+
+from jaxreg._core.status import Status
+from jaxreg.app.cli import outputs
+from jaxreg.app.cli.runtime import Options, Precision, Session
+from jaxreg.app.plot import draw_graph, save_figure, write_graph_report
+from jaxreg.app.result import result_folder, versions, write_json
+from jaxreg.averaging import (
+    AveragingSolution,
+    Correntropy,
+    MotionAveraging,
+    SpanningTree,
+    WeightedMotionAveraging,
+    average,
+)
+from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.io.atomic import require_writable
+from jaxreg.io.errors import InputError
+from jaxreg.io.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
+from jaxreg.io.poses.tum import write_tum
+from jaxreg.metrics import chordal_objective
+
+
+METHODS = {
+    "correntropy": Correntropy,
+    "plain": MotionAveraging,
+    "weighted": WeightedMotionAveraging,
+}
+FILES = ("result.json", "poses.tum", "graph.g2o", "figure.png", "report.html")
+
+
+@dataclass(frozen=True)
+class Average(Options):
+    """Find poses that agree with the relative motions of a pose graph."""
+
+    graph: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GRAPH.g2o")]
+    """A g2o file; its vertices are not used, the answer comes from its edges alone."""
+    method: Literal["correntropy", "plain", "weighted"] = "correntropy"
+    """Correntropy bears wrong edges; plain and weighted are for graphs without any."""
+    precision: Precision = field(default="float64", kw_only=True)
+    """Of the computation; graphs of thousands of poses need the digits."""
+    budget: Annotated[
+        int | None,
+        tyro.conf.arg(
+            metavar="INT", help_behavior_hint="(default: 100; plain, weighted: 50)"
+        ),
+    ] = None
+    """Steps of the method, at most."""
+
+    def run(self, session: Session) -> int:
+        """Runs the command; returns the exit code."""
+        if self.budget is not None and self.budget < 1:
+            raise InputError(f"--budget {self.budget}: wanted at least 1 step.")
+        steps = {} if self.budget is None else {"max_steps": self.budget}
+        method = METHODS[self.method](**steps)
+        with session.timed("read"), warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            graph = read_g2o(self.graph)
+            ids, _ = read_g2o_poses(self.graph)
+        for message in {str(w.message) for w in caught}:
+            session.console.print(message)
+        require_writable(self.out)
+        key = self.key()
+        with session.progress() as progress, session.timed("run", computes=True):
+            progress("averaging", 0, 2)
+            before = average(graph, method=SpanningTree(by="path"))
+            progress("averaging", 1, 2)
+            sol = average(graph, method=method, key=key)
+            jax.block_until_ready(sol)
+            progress("averaging", 2, 2)
+        objective = [
+            float(chordal_objective(graph, s.T_world_i)) for s in (before, sol)
+        ]
+        self._write(session, graph, before, sol, ids, objective)
+        _show(session, graph, sol, objective)
+        outputs.show_end(session, FILES, self.out)
+        return 0
+
+    def _write(
+        self,
+        session: Session,
+        graph: PoseGraph,
+        before: AveragingSolution,
+        sol: AveragingSolution,
+        ids: np.ndarray,
+        objective: list[float],
+    ) -> None:
+        with result_folder(self.out) as staging:
+            with session.timed("write"):
+                figure = draw_graph(
+                    np.asarray(graph.edges),
+                    np.asarray(before.T_world_i),
+                    np.asarray(sol.T_world_i),
+                    np.asarray(sol.placed),
+                )
+                save_figure(staging / "figure.png", figure)
+                write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids)
+                placed = np.asarray(sol.placed)
+                write_tum(
+                    staging / "poses.tum",
+                    np.asarray(sol.T_world_i)[placed],
+                    timestamps=ids[placed],
+                )
+            document = _document(sol, ids, objective)
+            document["edges"] = [
+                {"i": int(ids[i]), "j": int(ids[j]), "weight": float(w)}
+                for (i, j), w in zip(
+                    np.asarray(graph.edges).tolist(),
+                    np.asarray(sol.edge_weight),
+                    strict=True,
+                )
+            ]
+            document |= {
+                "command": session.command,
+                "seed": session.options.seed,
+                "times_s": {k: round(v, 3) for k, v in session.times.items()},
+                "versions": versions(),
+                "files": list(FILES),
+            }
+            write_json(staging / "result.json", document)
+            with outputs.page_or_message(session):
+                write_graph_report(
+                    staging / "report.html",
+                    graph,
+                    sol,
+                    before,
+                    ids.tolist(),
+                    details=outputs.page_details(session, document)
+                    | {k: document[k] for k in ("objective_before", "objective_after")},
+                )
+
+
+def _document(
+    sol: AveragingSolution, ids: np.ndarray, objective: list[float]
+) -> dict[str, Any]:
+    status = Status(int(sol.status))
+    poses = np.asarray(sol.T_world_i)
+    return {
+        "status": status.name,
+        "advice": status.advice,
+        "objective_before": objective[0],
+        "objective_after": objective[1],
+        "names": ids.tolist(),
+        "T_world_i": [
+            T.tolist() if ok else None
+            for T, ok in zip(poses, np.asarray(sol.placed), strict=True)
+        ],
+    }
+
+
+def _show(
+    session: Session, graph: PoseGraph, sol: AveragingSolution, objective: list[float]
+) -> None:
+    status = Status(int(sol.status))
+    table = Table(title=f"{graph.num_poses} poses, {graph.num_edges} edges")
+    table.add_column("poses")
+    table.add_column("objective", justify="right")
+    table.add_row("before (spanning tree)", f"{objective[0]:.8g}")
+    table.add_row("after", f"{objective[1]:.8g}")
+    session.console.print(table)
+    placed = np.asarray(sol.placed)
+    trusted = int(np.sum(np.asarray(sol.edge_weight) > 0.5))
+    session.console.print(
+        f"{status.name}: {int(placed.sum())} of {len(placed)} poses placed, {trusted} "
+        f"of {graph.num_edges} edges trusted, {int(sol.num_steps)} steps."
+    )
+    if status != Status.CONVERGED:
+        session.console.print(status.advice)
+    session.console.print(
+        "Objective: sum of kappa |R_j - R_i R_i_j|^2 + tau |t_j - t_i - R_i t_i_j|^2 "
+        "(SE-Sync)."
+    )

@@ -1,0 +1,137 @@
+"""Scans for the commands: read, checked, and moved near the origin."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxreg.io.errors import InputError
+from jaxreg.io.points.read import point_files, read_named, unique_names
+
+
+# Scans whose extents differ by such a factor are taken to be in different units.
+_OTHER_UNIT = 50.0
+# Registration draws some thousand points of a scan, pictures some hundred thousand.
+_MAX_POINTS = 2_000_000
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Scans as they were read, and where each came from.
+
+    Attributes:
+        names: unique names.
+        points: `(n_i, d)` arrays, rows with NaN or inf included.
+        places: file, and key or file name within, for messages.
+        notes: what was left out of them.
+    """
+
+    names: list[str]
+    points: list[np.ndarray]
+    places: list[str]
+    notes: tuple[str, ...] = ()
+
+    def centred(self) -> tuple[list[np.ndarray], np.ndarray]:
+        """Scans moved to their own middles, and these, `(v, d)` float64.
+
+        The former in the precision that JAX computes in. Map coordinates of seven
+        digits before the point are thereby cut to float32 without loss: the
+        subtraction is in float64.
+        """
+        dtype = jnp.result_type(float)
+        middles = [
+            np.median(x[np.isfinite(x).all(axis=1)].astype(np.float64), axis=0)
+            for x in self.points
+        ]
+        moved = [
+            (x.astype(np.float64) - c).astype(dtype)
+            for x, c in zip(self.points, middles, strict=True)
+        ]
+        return moved, np.stack(middles)
+
+
+def load_scans(paths: Sequence[Path]) -> Scans:
+    """Reads the scans of a command line and refuses what cannot be registered.
+
+    Raises:
+        InputError: if a file cannot be read, there are fewer than two scans, 2D and 3D
+            are mixed, a scan is far larger or smaller than the others, or has fewer
+            than d + 1 distinct finite points.
+    """
+    names: list[str] = []
+    points: list[np.ndarray] = []
+    places: list[str] = []
+    notes: list[str] = []
+    for path in paths:
+        found = [
+            item
+            for file in point_files(path)
+            for item in read_named(file, _MAX_POINTS).items()
+        ]
+        alone = len(found) == 1 and not path.is_dir()
+        for name, scan in found:
+            names.append(name)
+            points.append(scan.points)
+            places.append(str(path) if alone else f"{path} ({name})")
+            if scan.step > 1:
+                notes.append(
+                    f"{places[-1]}: large, one of {scan.step} points is used, "
+                    f"{len(scan.points):,} in all."
+                )
+    scans = Scans(unique_names(names), points, places, tuple(notes))
+    _require_two(scans)
+    _require_one_dimension(scans)
+    _require_one_unit(scans)
+    for place, array in zip(scans.places, scans.points, strict=True):
+        _require_points(place, array)
+    return scans
+
+
+def _require_two(scans: Scans) -> None:
+    if len(scans.names) < 2:
+        raise InputError(
+            f"{scans.places[0]}: this is one scan alone.\n"
+            "Give two or more: several files, a folder, or an NPZ file of scans."
+        )
+
+
+def _require_one_dimension(scans: Scans) -> None:
+    first = scans.points[0].shape[1]
+    for place, array in zip(scans.places, scans.points, strict=True):
+        if array.shape[1] != first:
+            raise InputError(
+                f"{place}: is {array.shape[1]}D, but {scans.places[0]} is {first}D.\n"
+                "Register 2D scans and 3D scans apart."
+            )
+
+
+def _require_one_unit(scans: Scans) -> None:
+    extents = np.array([_extent(x) for x in scans.points])
+    usual = np.median(extents)
+    for place, extent in zip(scans.places, extents, strict=True):
+        ratio = extent / usual if usual > 0 else 1.0
+        if ratio > _OTHER_UNIT or 0 < ratio < 1 / _OTHER_UNIT:
+            raise InputError(
+                f"{place}: spans {extent:.4g}, the others about {usual:.4g}: is it in "
+                "another unit?\nScale it to the unit of the others, or leave it out."
+            )
+
+
+def _extent(points: np.ndarray) -> float:
+    finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+    return float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 0.0
+
+
+def _require_points(place: str, array: np.ndarray) -> None:
+    finite = array[np.isfinite(array).all(axis=1)]
+    wanted = array.shape[1] + 1
+    distinct = len(np.unique(finite[:10_000], axis=0))
+    if distinct < wanted:
+        distinct = len(np.unique(finite, axis=0))
+    if distinct < wanted:
+        raise InputError(
+            f"{place}: holds {distinct} distinct finite points of {len(array)} rows, "
+            f"at least {wanted} are needed.\nExport the scan again, or leave it out."
+        )

@@ -1,0 +1,124 @@
+"""Entry point of the command `jaxreg`: parses, dispatches, and speaks of errors.
+
+Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted, 141
+when nobody reads the output any more.
+"""
+
+import _thread
+import io
+import os
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import NoReturn
+
+from jaxreg.app.result import version
+from jaxreg.io.errors import InputError, MissingExtraError
+
+
+_COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
+_INTERRUPTED, _UNREAD = 130, 141
+
+
+def command() -> NoReturn:
+    """The process `jaxreg`: runs the command of its arguments and ends."""
+    sys.unraisablehook = _heard_again
+    code = main()
+    if code == _INTERRUPTED:
+        # Threads may still compute, and crash as Python takes down what they use.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+def _heard_again(lost: "sys.UnraisableHookArgs") -> None:
+    """Interrupts again if Python dropped it, as in callbacks of garbage collection."""
+    if isinstance(lost.exc_value, KeyboardInterrupt):
+        threading.Timer(0.1, _interrupt).start()
+    else:
+        sys.__unraisablehook__(lost)
+
+
+def _interrupt() -> None:
+    """As Ctrl-C does: wakes the main thread from a system call, too."""
+    main_thread = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main_thread is not None:
+        signal.pthread_kill(main_thread, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+        argv: arguments without the program's name; None for those of the process.
+
+    Returns:
+        The exit code.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments = arguments or ["--help"]
+    if arguments in (["--version"], ["-V"]):
+        sys.stdout.write(f"jaxreg {version('jaxreg')}\n")
+        return 0
+    if sys.stdout is None:  # closed by the caller
+        sys.stdout = open(os.devnull, "w")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names need not be UTF-8
+    try:
+        return _run(arguments)
+    except (InputError, MissingExtraError) as err:
+        sys.stderr.write(f"jaxreg: {err}\n")
+        return 2
+    except BrokenPipeError:  # as in `jaxreg ... | head`: nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _UNREAD
+    except OSError as err:
+        where = f"{err.filename}: " if err.filename else ""
+        sys.stderr.write(
+            f"jaxreg: {where}{err.strerror or err}; nothing was written.\n"
+        )
+        return 2
+    except KeyboardInterrupt as err:
+        kept = str(err) or "no results were written"
+        sys.stderr.write(f"jaxreg: interrupted; {kept}.\n")
+        return _INTERRUPTED
+
+
+def _run(arguments: list[str]) -> int:
+    # All of them now: nobody wants to learn it when the results are to be written.
+    for package in ("tyro", "shtab", "rich", "plyfile", "matplotlib"):
+        if find_spec(package) is None:
+            raise MissingExtraError(package, "The command line")
+    if any(word.startswith(_COMPLETION) for word in arguments):
+        # Of tyro's two generators this one, by shtab, completes names of scans too.
+        os.environ["PYTHON_TYRO_BACKEND"] = "argparse"
+    import tyro
+
+    from jaxreg.app.cli import commands, runtime
+
+    command = tyro.cli(
+        commands.COMMANDS,
+        prog="jaxreg",
+        description=(
+            "Registers 2D and 3D point sets rigidly, without an initial guess, and "
+            "brings many scans into one frame."
+        ),
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    runtime.keep_compiled_programs()
+    if isinstance(command, commands.Info):
+        return command.run()
+    line = os.fsencode(shlex.join(["jaxreg", *arguments]))
+    session = runtime.Session(command, line.decode("utf-8", "backslashreplace"))
+    with command.computing():
+        code = command.run(session)
+    if command.json:
+        sys.stdout.write((command.out / "result.json").read_text(encoding="utf-8"))
+    return code

@@ -1,0 +1,216 @@
+"""`jaxreg multiview`: many scans into one frame."""
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+import jaxreg
+from jaxreg._core.status import Status
+from jaxreg._core.typing import Progress
+from jaxreg.app.cli import outputs
+from jaxreg.app.cli.inputs import Scans, load_scans
+from jaxreg.app.cli.runtime import SearchOptions, Session
+from jaxreg.app.pair_log import PairLog, Pairs
+from jaxreg.app.plot.results import result_of
+from jaxreg.app.result import Result, version
+from jaxreg.io.atomic import require_writable
+from jaxreg.io.errors import InputError
+from jaxreg.io.poses.stanford import read_conf
+
+
+Order = Literal["any", "sequential"]
+
+
+@dataclass(frozen=True)
+class Multiview(SearchOptions):
+    """Bring scans into one frame, without an initial guess."""
+
+    scans: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="SCAN ...", help_behavior_hint="(required)"),
+    ]
+    """Files (PLY, XYZ, PCD, LAS, ...), a folder of these, or an archive (NPZ, E57)."""
+    truth: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE.conf", help_behavior_hint="(default: none)"),
+    ] = None
+    """Poses as the Stanford repository has them, metres: adds a table of errors."""
+    order: Order = "any"
+    """Of the scans; sequential if each overlaps the next: fewer pairs are tried."""
+    viewpoint: Annotated[
+        tuple[float, ...] | None,
+        tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
+    ] = None
+    """Where the scanner stood in the frame of every scan, in its unit: often 0 0 0."""
+    resume: bool = False
+    """Go on with the pairs that an interrupted run left in the output folder."""
+
+    def run(self, session: Session) -> int:
+        """Runs the command; returns the exit code."""
+        with session.timed("read"):
+            if not self.scans:
+                raise InputError(
+                    "No scans given.\nUsage: jaxreg multiview SCAN SCAN ..."
+                )
+            scans = load_scans(self.scans)
+            _check_viewpoint(self.viewpoint, scans)
+            truth = None if self.truth is None else _read_truth(self.truth, scans)
+        for note in scans.notes:
+            session.console.print(note)
+        require_writable(self.out)
+        key, method, log = self.key(), self.method(), self._log(session, scans)
+        try:
+            with session.progress() as progress, session.timed("run", computes=True):
+                result = reconstruct_scans(
+                    scans, key, method, progress, self.order, log, self.viewpoint
+                )
+        except KeyboardInterrupt as err:
+            if not len(log):
+                raise
+            raise KeyboardInterrupt(
+                f"pairs kept in {log.path}: {len(log)}; "
+                "the same command with --resume goes on from there"
+            ) from err
+        require_two_placed(result, scans)
+        errors = None if truth is None else outputs.pose_errors(result, *truth)
+        report(session, result, scans, errors)
+        log.remove()
+        return 0
+
+    def _log(self, session: Session, scans: Scans) -> PairLog:
+        digest = hashlib.sha256(repr(scans.names).encode())
+        for points in scans.points:
+            digest.update(np.ascontiguousarray(points).tobytes())
+        run = {
+            "scans": digest.hexdigest(),
+            "seed": self.seed,
+            "viewpoint": self.viewpoint,
+            "budget": self.budget,
+            "precision": self.precision,
+            "version": version("jaxreg"),
+        }
+        log = PairLog(self.out / "pairs.jsonl", run, resume=self.resume)
+        if not self.resume and log.path.exists():
+            session.console.print(
+                f"{log.path}: pairs of an interrupted run, replaced by those of this "
+                "one; --resume would go on with them."
+            )
+        if self.resume and not len(log):
+            session.console.print(f"{log.path}: no pairs to go on with, all are new.")
+        return log
+
+
+def reconstruct_scans(
+    scans: Scans,
+    key: Any,
+    method: jaxreg.ParticleFilter,
+    progress: Progress,
+    order: Order = "any",
+    log: PairLog | None = None,
+    viewpoint: tuple[float, ...] | None = None,
+) -> Result:
+    """Reconstructs centred scans and moves the answer to the frames of the files.
+
+    Pairs that `log` holds are not registered again, and those found are added to it.
+    """
+    centred, middles = scans.centred()
+    eyes = None if viewpoint is None else (viewpoint - middles).astype(centred[0].dtype)
+    kept = None if log is None or log.pairs is None else log.pairs
+    sol = jaxreg.reconstruct(
+        centred,
+        key=key,
+        method=method,
+        order=order,
+        viewpoints=eyes,
+        previous=None if kept is None else jaxreg.RelativeMotions(*map(_array, kept)),
+        progress=progress,
+        on_pairs=None if log is None else lambda m: log.add(_pairs(m)),
+    )
+    result = result_of(sol, scans.points, scans.names)
+    # The frame of a component's first scan; that of a scan alone means nothing.
+    first = np.argmax(result.component[:, None] == result.component, axis=1)
+    i, j = result.edges.T
+    return dataclasses.replace(
+        result,
+        T_world_i=outputs.uncentre(result.T_world_i, middles[first], middles),
+        T_i_j=outputs.uncentre(result.T_i_j, middles[i], middles[j]),
+    )
+
+
+def _check_viewpoint(viewpoint: tuple[float, ...] | None, scans: Scans) -> None:
+    d = scans.points[0].shape[1]
+    if viewpoint is None:
+        return
+    if len(viewpoint) != d or not np.all(np.isfinite(viewpoint)):
+        found = " ".join(map(str, viewpoint))
+        raise InputError(f"--viewpoint: wanted {d} finite numbers, found {found}.")
+    for points, place in zip(scans.points, scans.places, strict=True):
+        if np.any(np.all(points == np.asarray(viewpoint), axis=1)):
+            raise InputError(
+                f"{place}: has points at --viewpoint.\n"
+                "Leave out rows that stand for missing returns."
+            )
+
+
+def _array(x: np.ndarray) -> Any:
+    """On the device, floats as the centred scans have them."""
+    return jnp.asarray(x, jnp.result_type(float) if x.dtype.kind == "f" else x.dtype)
+
+
+def _pairs(motions: Any) -> Pairs:
+    return Pairs(
+        *map(
+            np.asarray,
+            (motions.pairs, motions.T_i_j, motions.overlap, motions.inlier_rmse),
+        )
+    )
+
+
+def require_two_placed(result: Result, scans: Scans) -> None:
+    """Refuses a result in which no two scans could be joined.
+
+    Raises:
+        InputError: that names the scans, or the first of them and their number.
+    """
+    if result.placed.sum() >= 2:
+        return
+    places = scans.places
+    who = (
+        " and ".join(places)
+        if len(places) == 2
+        else f"{places[0]} and {len(places) - 1} more"
+    )
+    status = (
+        result.status if result.status != Status.DISCONNECTED else Status.LOW_OVERLAP
+    )
+    raise InputError(f"{who}: no two scans could be joined.\n{status.advice}")
+
+
+def report(
+    session: Session, result: Result, scans: Scans, errors: dict[str, Any] | None
+) -> None:
+    """Writes the files and prints the tables."""
+    outputs.write_files(session, result, scans.points, errors)
+    outputs.show_scans(session, result)
+    if errors is not None:
+        outputs.show_errors(session, errors)
+    outputs.show_end(session, result.files, session.options.out)
+
+
+def _read_truth(path: Path, scans: Scans) -> tuple[list[str], np.ndarray]:
+    poses = read_conf(path)
+    if scans.points[0].shape[1] != 3:
+        raise InputError(f"{path}: holds 3D poses, but the scans are 2D.")
+    common = [name for name in scans.names if name in poses]
+    if len(common) < 2:
+        raise InputError(
+            f"{path}: holds poses of {', '.join(list(poses)[:3])}, ... but the scans "
+            f"are {', '.join(scans.names[:3])}, ...\nGive the pose file of these scans."
+        )
+    return common, np.stack([poses[name] for name in common])

@@ -1,0 +1,98 @@
+"""`jaxreg register`: one scan onto another."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import tyro
+
+import jaxreg
+from jaxreg._core.status import Status
+from jaxreg.app.cli import outputs
+from jaxreg.app.cli.inputs import Scans, load_scans
+from jaxreg.app.cli.runtime import SearchOptions, Session
+from jaxreg.app.plot.results import result_of
+from jaxreg.app.result import Result
+from jaxreg.io.atomic import require_writable
+from jaxreg.io.errors import InputError
+
+
+@dataclass(frozen=True)
+class Register(SearchOptions):
+    """Move one scan onto another, without an initial guess."""
+
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
+    """The scan that moves: PLY, XYZ, PCD, LAS, OBJ, ..., or FILE.npz:KEY."""
+    target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
+    """The scan that stays; its frame is that of the result."""
+
+    def run(self, session: Session) -> int:
+        """Runs the command; returns the exit code."""
+        with session.timed("read"):
+            scans = load_scans([self.target, self.source])
+        if len(scans.names) != 2:
+            raise InputError(
+                f"{self.target} and {self.source}: hold {len(scans.names)} scans.\n"
+                "Name one of each (FILE.npz:KEY), or use: jaxreg multiview"
+            )
+        for note in scans.notes:
+            session.console.print(note)
+        require_writable(self.out)
+        key, method = self.key(), self.method()
+        with session.progress() as progress, session.timed("run", computes=True):
+            progress("registering", 0, 1)
+            result, modes, covariances = _register(scans, key, method)
+            progress("registering", 1, 1)
+        if not result.placed[1]:
+            raise InputError(
+                f"{self.source} onto {self.target}: {result.status.name}.\n"
+                f"{result.status.advice}"
+            )
+        outputs.write_files(
+            session, result, scans.points, modes=modes, covariances=covariances
+        )
+        _show(session, result)
+        return 0
+
+
+def _register(
+    scans: Scans, key: jax.Array, method: jaxreg.ParticleFilter
+) -> tuple[Result, tuple[np.ndarray, ...], np.ndarray]:
+    """The result, the modes of the posterior, and the covariances of both poses."""
+    centred, middles = scans.centred()
+    target, source = (x[np.isfinite(x).all(axis=1)] for x in centred)
+    sol = jaxreg.register(source, target, method, key=key)
+    T_target_source = outputs.uncentre(
+        np.asarray(sol.T_target_source)[None], middles[0], middles[1]
+    )
+    result = dataclasses.replace(
+        result_of(sol, scans.points, scans.names),
+        T_world_i=np.stack([np.eye(len(T_target_source[0])), T_target_source[0]]),
+        T_i_j=T_target_source,
+    )
+    moved = outputs.uncentre(
+        np.asarray(sol.modes.T_target_source), middles[0], middles[1]
+    )
+    modes = (moved, np.asarray(sol.modes.weight), np.asarray(sol.modes.fitness))
+    covariance = np.asarray(sol.covariance)
+    return result, modes, np.stack([np.zeros_like(covariance), covariance])
+
+
+def _show(session: Session, result: Result) -> None:
+    target, source = result.names
+    session.console.print(
+        f"{result.status.name}: {source} lies on {target} with overlap "
+        f"{result.overlap[0]:.3f} and inlier RMSE {result.inlier_rmse[0]:.4g}."
+    )
+    if result.status != Status.CONVERGED:
+        session.console.print(result.status.advice)
+    dropped = int(result.num_dropped.sum())
+    if dropped:
+        session.console.print(f"{dropped:,} rows with NaN or inf were left out.")
+    session.console.print(f"T_{target}_{source} =")
+    for row in result.T_world_i[1]:
+        session.console.print("  " + " ".join(f"{x:14.9g}" for x in row))
+    outputs.show_end(session, result.files, session.options.out)

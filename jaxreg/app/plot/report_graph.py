@@ -1,0 +1,115 @@
+"""`report.html` of an averaged pose graph."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxreg
+from jaxreg._core.status import Status
+from jaxreg.app.plot.figure import principal_axes, tilt
+from jaxreg.app.plot.report_curves import trace_curves
+from jaxreg.app.plot.report_page import write_page
+from jaxreg.app.plot.report_parts import (
+    details_entry,
+    deviations,
+    floats,
+    raw,
+    status_entry,
+)
+from jaxreg.app.plot.results import MAX_COVARIANCES, residuals
+
+
+_MAX_ROWS = 400
+
+
+def write_graph_report(
+    path: str | Path,
+    graph: "jaxreg.PoseGraph",
+    solution: "jaxreg.AveragingSolution",
+    before: "jaxreg.AveragingSolution | None" = None,
+    names: Sequence[Any] | None = None,
+    *,
+    covariances: Any = None,
+    details: Mapping[str, Any] | None = None,
+) -> None:
+    """Writes an averaged pose graph as one HTML page that opens from disk.
+
+    The page shows the positions and edges before and after, the edges by whether they
+    are trusted and how far they are off, beside the width of the kernel, how the steps
+    came to rest, the poses, and how they were made.
+
+    Args:
+        path: the HTML file; it appears whole or not at all.
+        graph: the relative motions.
+        solution: what `average` made of them.
+        before: poses to compare with; None for those along a spanning tree.
+        names: of the frames; their numbers by default.
+        covariances: `(v, k, k)`; by default, for some hundred frames, those that
+            `pose_covariances` gives.
+        details: as in `write_report`, and `objective_before`, `objective_after`.
+
+    Raises:
+        InputError: if the file cannot be written.
+        MissingExtraError: if plotly is not installed.
+    """
+    if before is None:
+        before = jaxreg.average(graph, method=jaxreg.SpanningTree(by="path"))
+    T = np.asarray(solution.T_world_i, np.float64)
+    labels = [str(x) for x in (range(len(T)) if names is None else names)]
+    placed = np.asarray(solution.placed, bool)
+    keep = np.asarray(graph.mask)
+    edges = np.asarray(graph.edges)[keep]
+    weight = np.asarray(solution.edge_weight, np.float64)[keep]
+    origin = np.median(T[placed][:, :-1, -1], axis=0)
+    old = np.asarray(before.T_world_i, np.float64)
+    angle, distance = residuals(T, edges, np.asarray(graph.T_i_j)[keep])
+    if covariances is None and len(T) <= MAX_COVARIANCES:
+        covariances = jaxreg.pose_covariances(graph, solution)
+    title = f"{len(T):,} poses from {len(edges):,} edges"
+    data = {
+        "kind": "graph",
+        "title": title,
+        "dim": graph.dim,
+        "status": status_entry(Status(int(solution.status))),
+        "camera": _camera_on_path(T),
+        "num_placed": int(placed.sum()),
+        "num_poses": len(T),
+        "num_trusted": int(np.sum(weight > 0.5)),
+        "before": floats(old[:, :-1, -1] - origin),
+        "after": floats(T[:, :-1, -1] - origin),
+        "placed": raw(placed.astype(np.uint8)),
+        "edges": raw(edges.astype("<i4")),
+        "weight": floats(weight),
+        "angle": floats(angle),
+        "distance": floats(distance),
+        "names": labels,
+        "scans": _rows(labels, placed, T, deviations(covariances, len(T))),
+        "kernel_width": np.asarray(solution.kernel_width, np.float64).tolist(),
+        "steps": int(solution.num_steps),
+        "residual": float(solution.residual),
+        "curves": trace_curves(solution.trace, int(solution.num_steps)),
+        "details": details_entry(details),
+    }
+    write_page(path, title, data)
+
+
+def _rows(
+    names: list[str], placed: np.ndarray, T_world_i: np.ndarray, sigma: np.ndarray
+) -> list[dict[str, Any]]:
+    """Of the table of poses, which does not show thousands."""
+    return [
+        {"name": name, "placed": bool(ok), "T": T.tolist(), "sigma": s.tolist()}
+        for name, ok, T, s in zip(
+            names[:_MAX_ROWS], placed, T_world_i, sigma, strict=False
+        )
+    ]
+
+
+def _camera_on_path(T_world_i: np.ndarray) -> list[list[float]] | None:
+    """Most trajectories are flat: look down on them at an angle."""
+    if T_world_i.shape[1] == 3:
+        return None
+    axes, _ = principal_axes(T_world_i[:, :3, 3])
+    return (tilt(35.0, 0.0) @ axes[[1, 2, 0]]).tolist()

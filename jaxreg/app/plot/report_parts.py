@@ -1,0 +1,42 @@
+"""What the pages of scans and of graphs have in common."""
+
+import base64
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxreg._core.status import Status
+from jaxreg.app.result import versions
+
+
+def status_entry(status: Status) -> dict[str, str]:
+    """Name and advice."""
+    return {"name": status.name, "advice": status.advice}
+
+
+def deviations(covariances: Any, num: int) -> np.ndarray:
+    """`(v, 2)` standard deviations: of the position, and of the rotation in radians."""
+    if covariances is None:
+        return np.full((num, 2), np.nan)
+    C = np.asarray(covariances, np.float64)
+    variance = np.diagonal(C, axis1=1, axis2=2)
+    d = 2 if C.shape[-1] == 3 else 3
+    return np.sqrt(
+        np.stack([variance[:, :d].sum(axis=1), variance[:, d:].sum(axis=1)], axis=1)
+    )
+
+
+def details_entry(details: Mapping[str, Any] | None) -> dict[str, Any]:
+    """How a result was made, the versions of this process by default."""
+    return {"versions": versions(), **({} if details is None else details)}
+
+
+def floats(x: np.ndarray) -> str:
+    """Float32 numbers as text."""
+    return raw(x.astype("<f4"))
+
+
+def raw(x: np.ndarray) -> str:
+    """The bytes of an array as text."""
+    return base64.b64encode(np.ascontiguousarray(x).tobytes()).decode("ascii")

@@ -1,0 +1,320 @@
+"""The files of a result: result.json, and of each component poses, graph, points.
+
+A `Result` is what a reconstruction or registration found, on the host and in float64,
+in the frames and unit of the files that were read.
+"""
+
+import contextlib
+import json
+import math
+import platform
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxreg._core.status import Status
+from jaxreg.app.colors import scan_colors
+from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.io.atomic import atomic_folder, atomic_write
+from jaxreg.io.graphs.g2o import write_g2o
+from jaxreg.io.points.ply import write_ply
+from jaxreg.io.poses.tum import write_tum
+
+
+_ROW = re.compile(r"\[[-+.,\d\seE]*\]")
+MAX_MERGED_POINTS = 2_000_000
+_PER_COMPONENT = ("poses.tum", "graph.g2o", "merged.ply")
+
+
+@dataclass(frozen=True)
+class Result:
+    """Poses of scans and the pairs that they rest on.
+
+    Attributes:
+        names: of the `v` scans.
+        T_world_i: `(v, d+1, d+1)` float64 poses, in a frame of each component's own.
+        component: `(v,)` number of each scan's component: 0 is the model, others are
+            models of their own, -1 means that the pose means nothing.
+        status: of the whole.
+        scan_status: `(v,)` of each scan.
+        num_points: `(v,)` rows read.
+        num_dropped: `(v,)` rows with NaN or inf, which were left out.
+        edges: `(e, 2)` the pairs i, j that were evaluated.
+        T_i_j: `(e, d+1, d+1)` float64, maps scan j into the frame of scan i.
+        overlap: `(e,)` share of the points that have a partner.
+        weight: `(e,)` final trust, 0 to 1.
+        inlier_rmse: `(e,)` in the unit of the scans.
+        trace: of the solution, for the page.
+    """
+
+    names: list[str]
+    T_world_i: np.ndarray
+    component: np.ndarray
+    status: Status
+    scan_status: np.ndarray
+    num_points: np.ndarray
+    num_dropped: np.ndarray
+    edges: np.ndarray
+    T_i_j: np.ndarray
+    overlap: np.ndarray
+    weight: np.ndarray
+    inlier_rmse: np.ndarray
+    trace: Any = None
+
+    @property
+    def placed(self) -> np.ndarray:
+        """`(v,)` the scans of the model, component 0."""
+        return self.component == 0
+
+    @property
+    def num_components(self) -> int:
+        """At least one."""
+        return int(self.component.max(initial=0)) + 1
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the files of the result, the picture and the page included."""
+        more = [
+            file_of(name, k)
+            for k in range(1, self.num_components)
+            for name in _PER_COMPONENT
+        ]
+        return ["result.json", *_PER_COMPONENT, "figure.png", "report.html", *more]
+
+    def best_pair(self, scan: int) -> int | None:
+        """The row of the pair of this scan that overlaps most, None without pairs."""
+        rows = np.flatnonzero((self.edges == scan).any(axis=1))
+        return int(rows[np.argmax(self.overlap[rows])]) if len(rows) else None
+
+    def partner(self, scan: int, row: int) -> int:
+        """The other scan of a pair."""
+        i, j = self.edges[row]
+        return int(j if i == scan else i)
+
+
+def result_document(
+    result: Result,
+    *,
+    command: str,
+    seed: int,
+    times: dict[str, float],
+    errors: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """What result.json holds: plain lists and numbers, null for what has no value.
+
+    Args:
+        result: poses and pairs.
+        command: the command line that made it.
+        seed: of the random numbers.
+        times: seconds by name.
+        errors: against a known truth, or None.
+    """
+    document = {
+        "command": command,
+        "seed": seed,
+        "status": result.status.name,
+        "advice": result.status.advice,
+        "names": result.names,
+        "T_world_i": [
+            T.tolist() if ok else None
+            for T, ok in zip(result.T_world_i, result.component >= 0, strict=True)
+        ],
+        "scans": [_scan_entry(result, i) for i in range(len(result.names))],
+        "pairs": [_pair_entry(result, e) for e in range(len(result.edges))],
+        "times_s": times,
+        "versions": versions(),
+        "files": result.files,
+    }
+    return document if errors is None else {**document, "errors": errors}
+
+
+@contextlib.contextmanager
+def result_folder(folder: str | Path) -> Iterator[Path]:
+    """`atomic_folder`, without what an earlier result there has and this one lacks.
+
+    A folder then never mixes two results: `merged_2.ply` goes if the new result has one
+    component. Only files that the earlier result.json names are removed.
+
+    Raises:
+        InputError: if the folder cannot be written.
+    """
+    with atomic_folder(folder, replaces=_files_of_earlier(Path(folder))) as staging:
+        yield staging
+
+
+def _files_of_earlier(folder: Path) -> set[str]:
+    try:
+        document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        names = document.get("files", [])
+        return {n for n in names if n == Path(n).name and n not in ("", ".", "..")}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return set()  # none there, or another program's
+
+
+def write_json(path: str | Path, document: dict[str, Any]) -> None:
+    """Writes a document as JSON; numbers that are not finite become null."""
+    text = json.dumps(without_nan(document), indent=1, allow_nan=False)
+    # Rows of matrices on one line, so that a person can read them.
+    text = _ROW.sub(lambda row: " ".join(row[0].split()), text)
+    with atomic_write(path) as file:
+        file.write(text + "\n")
+
+
+def write_result(
+    folder: str | Path,
+    result: Result,
+    scans: Sequence[np.ndarray],
+    document: dict[str, Any],
+) -> None:
+    """Writes result.json, poses.tum, graph.g2o and merged.ply into an existing folder.
+
+    Components beside the model have files of their own, see `file_of`; scans alone are
+    in result.json only. In poses.tum the timestamp, in graph.g2o the id is the number
+    of the scan. graph.g2o holds the pairs that are trusted, the information being the
+    trust times the identity.
+
+    Raises:
+        InputError: if a file cannot be written.
+        MissingExtraError: if plyfile is not installed.
+    """
+    folder = Path(folder)
+    write_json(folder / "result.json", document)
+    for k in range(result.num_components):
+        member = result.component == k
+        points, owner = merge_scans(scans, result.T_world_i, member)
+        colors = scan_colors(len(scans))[owner]
+        write_ply(folder / file_of("merged.ply", k), points, colors)
+        ids = np.flatnonzero(member)
+        graph = _trusted_graph(result, ids)
+        # Files keep the digits of float64 whatever the precision of the computation.
+        with jax.enable_x64(True):
+            T_world_i = jnp.asarray(result.T_world_i[ids])
+            write_tum(folder / file_of("poses.tum", k), T_world_i, timestamps=ids)
+            write_g2o(folder / file_of("graph.g2o", k), graph, T_world_i, ids)
+
+
+def file_of(name: str, component: int) -> str:
+    """The name of a component's file: merged.ply, merged_1.ply, ..."""
+    stem, _, suffix = name.rpartition(".")
+    return f"{stem}_{component}.{suffix}" if component else name
+
+
+def merge_scans(
+    scans: Sequence[np.ndarray],
+    T_world_i: np.ndarray,
+    placed: np.ndarray,
+    max_points: int = MAX_MERGED_POINTS,
+) -> tuple[np.ndarray, np.ndarray]:
+    """All placed scans in the common frame.
+
+    Above `max_points` one point per cube is kept, the cubes being as small as that
+    number allows within a factor of 1.25.
+
+    Returns:
+        `(n, d)` points, float32 if all scans are, else float64, and `(n,)` the scan
+        that each comes from. Rows with NaN or inf are left out.
+    """
+    parts, owner = [], []
+    for k, (scan, T) in enumerate(zip(scans, T_world_i, strict=True)):
+        if placed[k]:
+            finite = scan[np.isfinite(scan).all(axis=1)].astype(np.float64)
+            parts.append(finite @ T[:-1, :-1].T + T[:-1, -1])
+            owner.append(np.full(len(finite), k))
+    points, owners = np.concatenate(parts), np.concatenate(owner)
+    if len(points) > max_points:
+        keep = _thin(points, max_points)
+        points, owners = points[keep], owners[keep]
+    narrow = all(s.dtype == np.float32 for s in scans)
+    return points.astype(np.float32 if narrow else np.float64), owners
+
+
+def version(package: str) -> str:
+    """The version of an installed package; a bare source tree has none."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on, and the device."""
+    found = {name: version(name) for name in ("jaxreg", "jax", "jaxlib", "numpy")}
+    device = jax.devices()[0]
+    return {
+        **found,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "device": f"{device.platform} {device.device_kind}",
+    }
+
+
+def _scan_entry(result: Result, i: int) -> dict[str, Any]:
+    status = Status(int(result.scan_status[i]))
+    row = result.best_pair(i)
+    best = None if row is None else _pair_entry(result, row, motion=False)
+    return {
+        "name": result.names[i],
+        "placed": bool(result.placed[i]),
+        "component": int(result.component[i]),
+        "status": status.name,
+        "advice": status.advice,
+        "num_points": int(result.num_points[i]),
+        "num_dropped": int(result.num_dropped[i]),
+        "best_pair": best,
+    }
+
+
+def _pair_entry(result: Result, e: int, motion: bool = True) -> dict[str, Any]:
+    i, j = (int(k) for k in result.edges[e])
+    entry: dict[str, Any] = {
+        "i": result.names[i],
+        "j": result.names[j],
+        "overlap": float(result.overlap[e]),
+        "weight": float(result.weight[e]),
+        "inlier_rmse": float(result.inlier_rmse[e]),
+    }
+    return {**entry, "T_i_j": result.T_i_j[e].tolist()} if motion else entry
+
+
+def _trusted_graph(result: Result, ids: np.ndarray) -> PoseGraph:
+    number = np.full(len(result.names), -1)
+    number[ids] = np.arange(len(ids))
+    edges = number[result.edges]
+    keep = (edges >= 0).all(axis=1) & (result.weight > 1e-6)
+    return PoseGraph.from_edges(
+        edges[keep],
+        result.T_i_j[keep],
+        num_poses=len(ids),
+        weight=result.weight[keep],
+    )
+
+
+def _thin(points: np.ndarray, max_points: int) -> np.ndarray:
+    low = points.min(axis=0)
+    extent = float(np.ptp(points, axis=0).max())
+    size = extent / 4096
+    while True:
+        cell = ((points - low) / size).astype(np.int64)
+        strides = np.cumprod([1, *(cell.max(axis=0)[:-1] + 1)])
+        _, first = np.unique(cell @ strides, return_index=True)
+        if len(first) <= max_points:
+            return np.sort(first)
+        size *= 1.25
+
+
+def without_nan(value: Any) -> Any:
+    """Dicts and lists for JSON: numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {str(k): without_nan(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_nan(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,1 @@
+"""Methods of motion averaging, one algorithm a file."""

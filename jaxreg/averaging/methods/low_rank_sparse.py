@@ -1,0 +1,157 @@
+"""Poses from a low-rank plus sparse split of all relative motions (LRS of the paper).
+
+The matrix of blocks T_i_j = inv(T_world_i) T_world_j is the product of a (4 v, 4) and a
+(4, 4 v) matrix. Absent blocks and wrong ones are split off.
+
+Reference: Arrigoni, Rossi, Fusiello 2016 (R-GoDec); block-wise shrinkage as in their
+paper on SE(3) of 2018.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core.arrays import traced
+from jaxreg._core.compile import compiled
+from jaxreg._core.typing import Key
+from jaxreg.averaging.base import (
+    AbstractAverager,
+    AveragingSolution,
+    length_scale,
+    solution,
+)
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.linear.laplacian import DENSE_LIMIT
+
+
+class LowRankSparse(AbstractAverager):
+    """The LRS initialiser: needs many edges, bears some wrong ones.
+
+    Minimises |X - L - S1 - S2|_F^2 / 2 + threshold * sum of |S1 block|_F with L of rank
+    d + 1, S1 on the observed blocks and S2 on the absent ones, where X is 0, in turns.
+    Poses are the first block column of L, projected onto SE(d). The matrix is dense:
+    for at most `DENSE_LIMIT` frames. `init` is ignored; prior weights only say which
+    edges are there and average several edges of a pair.
+
+    Attributes:
+        threshold: blocks further than this (Frobenius norm, lengths in the length
+            scale of the graph) from L count as wrong and pull with this force alone.
+        max_steps: largest number of turns (static).
+        tolerance: stop when L changes by less than this share.
+
+    Raises:
+        ValueError: for more than `DENSE_LIMIT` frames.
+
+    Gradients: none (cut); it serves as a start. `edge_weight` is threshold / distance
+    of the block from L, at most 1.
+    """
+
+    threshold: Array | float = traced(0.05)
+    max_steps: int = eqx.field(static=True, default=1000)
+    tolerance: Array | float = traced(1e-5)
+
+    @compiled
+    def solve(
+        self,
+        graph: PoseGraph,
+        init: Float[Array, "v D D"] | None,
+        key: Key | None,
+    ) -> AveragingSolution:
+        """Splits the matrix of a prepared graph."""
+        num, D = graph.num_poses, graph.dim + 1
+        if num > DENSE_LIMIT:
+            raise ValueError(
+                f"LowRankSparse: wanted at most {DENSE_LIMIT} poses, found {num}; "
+                "use SpanningTree or CycleConsensus."
+            )
+        graph, self = jax.lax.stop_gradient((graph, self))
+        scale = length_scale(graph)
+        X, seen = _blocks(graph, scale)
+        limit = jnp.maximum(self.tolerance, 8 * jnp.finfo(X.dtype).eps)
+
+        def unfinished(s: _State) -> Array:
+            return (s.change > limit) & (s.step < self.max_steps)
+
+        eye = jnp.tile(jnp.eye(D, dtype=X.dtype), (num, 1))
+        start = _State(
+            basis=eye,
+            L=jnp.zeros((num * D, num * D), X.dtype),
+            change=jnp.asarray(jnp.inf, X.dtype),
+            step=jnp.asarray(0, jnp.int32),
+        )
+        end = jax.lax.while_loop(
+            unfinished, lambda s: _turn(X, seen, jnp.asarray(self.threshold), s), start
+        )
+        distance = _block_norms(X - end.L, num)[graph.edges[:, 0], graph.edges[:, 1]]
+        return solution(
+            graph,
+            _poses(end.L, num, scale),
+            edge_weight=self.threshold / jnp.maximum(distance, self.threshold),
+            converged=end.change <= limit,
+            num_steps=end.step,
+        )
+
+
+class _State(NamedTuple):
+    basis: Array  # (v D, D) spans the columns of L
+    L: Array
+    change: Array
+    step: Array
+
+
+def _turn(X: Array, seen: Array, threshold: Array, s: _State) -> _State:
+    """S1 and S2 for the present L, then L by one step of subspace iteration."""
+    num = seen.shape[0]
+    D = X.shape[0] // num
+    gap = X - s.L
+    norm = _block_norms(gap, num)
+    kept = jnp.minimum(threshold / jnp.where(norm > 0, norm, 1), 1)
+    # X - S1 - S2 is L plus the share of the gap that is not split off.
+    share = jnp.repeat(jnp.repeat(jnp.where(seen, kept, 0), D, 0), D, 1)
+    rest = s.L + share * gap
+    basis = jnp.linalg.qr(rest @ (rest.T @ s.basis))[0]
+    L = basis @ (basis.T @ rest)
+    size = jnp.sqrt(jnp.sum(L**2))
+    change = jnp.sqrt(jnp.sum((L - s.L) ** 2)) / jnp.where(size > 0, size, 1)
+    return _State(basis, L, change, s.step + 1)
+
+
+def _block_norms(A: Array, num: int) -> Float[Array, "v v"]:
+    D = A.shape[0] // num
+    return jnp.sqrt(jnp.sum(A.reshape(num, D, num, D) ** 2, axis=(1, 3)))
+
+
+def _blocks(
+    graph: PoseGraph, scale: Array
+) -> tuple[Float[Array, "n n"], Bool[Array, "v v"]]:
+    """The matrix of observed motions, lengths over `scale`, and where it has blocks."""
+    num, D = graph.num_poses, graph.dim + 1
+    i, j = graph.edges[:, 0], graph.edges[:, 1]
+    T = lie.compose(lie.rotation(graph.T_i_j), lie.translation(graph.T_i_j) / scale)
+    w = graph.weight[:, None, None]
+    total = jnp.zeros((num, num), w.dtype)
+    total = total.at[i, j].add(graph.weight).at[j, i].add(graph.weight)
+    X = jnp.zeros((num, num, D, D), w.dtype)
+    X = X.at[i, j].add(w * T).at[j, i].add(w * lie.inverse(T))
+    X = X / jnp.where(total > 0, total, 1)[..., None, None]
+    own, held = jnp.arange(num), jnp.any(total > 0, axis=1)
+    eye = jnp.where(held[:, None, None], jnp.eye(D, dtype=w.dtype), 0)
+    X = X.at[own, own].set(eye)
+    seen = (total > 0).at[own, own].set(held)
+    return X.transpose(0, 2, 1, 3).reshape(num * D, num * D), seen
+
+
+def _poses(L: Array, num: int, scale: Array) -> Float[Array, "v D D"]:
+    """The first block column, which holds T_i_0, as poses T_0_i."""
+    D = L.shape[0] // num
+    column = L[:, :D].reshape(num, D, D)
+    eye = jnp.eye(D, dtype=L.dtype)
+    known = jnp.linalg.norm(column[0] - eye) < 0.9  # else it may be singular
+    column = column @ jnp.where(known, jnp.linalg.inv(column[0]), eye)
+    T_i_0 = lie.compose(column[:, :-1, :-1], scale * column[:, :-1, -1])
+    T_i_0 = lie.orthonormalise(T_i_0)
+    return lie.inverse(T_i_0).at[0].set(eye)

@@ -1,0 +1,1 @@
+"""Poses to start from: safest trees, by the evidence of cycles."""

@@ -1,0 +1,75 @@
+"""Closures of a sequence that others next to them confirm."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxreg.averaging.base import length_scale
+from jaxreg.geometry import lie
+from jaxreg.graph import trees
+from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.trees import along_frames
+
+
+# Ends of closures next to each other are less than so many frames apart; each closure
+# is compared with so many that follow it in their order; errors of agreement, radians
+# and length scales.
+_NEAR, _COMPARED, _AGREES = 8, 3, 0.3
+# What others count that hold a frame; the shares of confirmed closures, and of frames
+# measured from the one before, below which all count.
+_DOUBTED, _USUAL, _SEQUENCE = 1e-3, 0.25, 0.5
+
+
+def without_lone_closures(graph: PoseGraph) -> PoseGraph:
+    """The graph without closures that no other confirms; little of those it hangs on.
+
+    A sequence passes a place again for some frames and closes several loops there,
+    which agree with each other along the frames between their ends. False closures
+    stand alone as a rule. Where few closures are confirmed, as in graphs that are no
+    sequences, all keep their weight. For starts: any weight of false closures bends a
+    long sequence, which hardly resists, so only those stay that join components.
+    """
+    successive = jnp.abs(graph.edges[:, 0] - graph.edges[:, 1]) == 1
+    closure = (graph.weight > 0) & ~successive
+    supported = confirmed(graph, closure)
+    usual = jnp.sum(supported) >= _USUAL * jnp.sum(closure)
+    steps = jnp.sum((graph.weight > 0) & successive)
+    usual = usual & (steps >= _SEQUENCE * (graph.num_poses - 1))
+    doubted = closure & ~supported & usual
+    weight = jnp.where(doubted, _DOUBTED * graph.weight, graph.weight)
+    tree = trees.maximum_spanning_tree(
+        graph.edges, graph.T_i_j, weight, graph.num_poses
+    )
+    weight = jnp.where(doubted & ~tree.in_tree, 0, weight)
+    return eqx.tree_at(lambda g: g.weight, graph, weight)
+
+
+def confirmed(graph: PoseGraph, closure: Bool[Array, " e"]) -> Bool[Array, " e"]:
+    """Closures that agree with another whose ends are near theirs."""
+    turned = graph.edges[:, 0] > graph.edges[:, 1]
+    T_low_high = jnp.where(turned[:, None, None], lie.inverse(graph.T_i_j), graph.T_i_j)
+    low, high = jnp.min(graph.edges, axis=1), jnp.max(graph.edges, axis=1)
+    T_world_i, scale = along_frames(graph), length_scale(graph)
+    order = jnp.arange(graph.num_edges, dtype=jnp.int32)
+    cell = jnp.where(closure, low // _NEAR, graph.num_poses)
+    order = jax.lax.sort((cell, high, order), num_keys=2)[2]
+    cell, low, high, T_low_high = (x[order] for x in (cell, low, high, T_low_high))
+    # The motion between the chained places of the ends that the closure asks for.
+    gap = product(T_world_i[low], product(T_low_high, lie.inverse(T_world_i)[high]))
+    supported = jnp.zeros((graph.num_edges,), bool)
+    for step in range(1, _COMPARED + 1):
+        k, m = jnp.roll(low, -step), jnp.roll(high, -step)
+        expected = product(lie.inverse(T_world_i)[k], product(gap, T_world_i[m]))
+        error = product(lie.inverse(jnp.roll(T_low_high, -step, axis=0)), expected)
+        near = (jnp.roll(cell, -step) == cell) & (jnp.abs(m - high) < _NEAR)
+        agree = near & closure[order] & (_size(error, scale) < _AGREES**2)
+        supported = supported | agree | jnp.roll(agree, step)
+    return jnp.zeros((graph.num_edges,), bool).at[order].set(supported)
+
+
+def _size(T: Float[Array, "e D D"], scale: Float[Array, ""]) -> Float[Array, " e"]:
+    """Squared angle (chordal) plus squared length over `scale`."""
+    turn = lie.rotation(T) - jnp.eye(T.shape[-1] - 1, dtype=T.dtype)
+    shift = lie.translation(T)
+    return jnp.sum(turn**2, axis=(1, 2)) / 2 + jnp.sum(shift**2, axis=1) / scale**2

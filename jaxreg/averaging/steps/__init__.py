@@ -1,0 +1,1 @@
+"""What methods of averaging repeat: weights, one solve, updated poses."""

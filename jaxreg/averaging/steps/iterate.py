@@ -1,0 +1,173 @@
+"""The loop of motion averaging: kernel width, trust, one solve, updated poses."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg.averaging.base import length_scale, weighted_mean
+from jaxreg.averaging.steps.implicit import differentiable
+from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.linear.laplacian import divergence, solve_flow
+
+
+#: Relative tolerance of a step's system: each step takes up what the last one left.
+STEP_TOLERANCE = 1e-4
+#: Kernel widths `(2,)` (length, radians) at given poses, from the widths before.
+WidthOf = Callable[[PoseGraph, Array, Array], Array]
+#: Trust of each edge `(e,)` at given poses and widths.
+TrustOf = Callable[[PoseGraph, Array, Array], Array]
+#: Weights `(e,)` of the Laplacian from prior weight and trust.
+RowsOf = Callable[[PoseGraph, Array], Array]
+#: New poses from poses, trust and widths.
+Step = Callable[[PoseGraph, Array, Array, Array], Array]
+
+
+def held_width(graph: PoseGraph, T: Array, width: Array) -> Array:
+    """The width as it is, without derivatives."""
+    return width
+
+
+class Iterated(NamedTuple):
+    """Where the loop stopped."""
+
+    T_world_i: Float[Array, "v D D"]
+    trust: Float[Array, " e"]
+    width: Float[Array, "2"]
+    converged: Bool[Array, ""]
+    num_steps: Int[Array, ""]
+    trace: AveragingTrace
+
+
+class _State(NamedTuple):
+    T: Array
+    width: Array
+    change: Array
+    step: Array
+    rows: Array  # of the trace
+
+
+def nearby_rotation(T: Float[Array, "*b D D"]) -> Float[Array, "*b D D"]:
+    """One Newton step back onto SE(d), exact to second order in the departure."""
+    R = lie.rotation(T)
+    gram = product(jnp.swapaxes(R, -1, -2), R)
+    eye = jnp.eye(R.shape[-1], dtype=R.dtype)
+    return lie.compose(product(R, 1.5 * eye - 0.5 * gram), lie.translation(T))
+
+
+def averaging_step(rows_of: RowsOf) -> Step:
+    """One weighted step of motion averaging (Eq. 14-20), updated on the left.
+
+    T_world_i <- exp(dm_i) T_world_i: Eq. 21 with the update on the side that Eq. 14
+    asks for. As printed, on the right, the iteration diverges.
+    """
+
+    def step(graph: PoseGraph, T: Array, trust: Array, width: Array) -> Array:
+        weight, num = rows_of(graph, trust), graph.num_poses
+
+        def solve(flow: Array) -> Array:
+            return solve_flow(graph.edges, weight, flow, num, STEP_TOLERANCE)
+
+        return averaged(graph, T, solve)
+
+    return step
+
+
+def averaged(
+    graph: PoseGraph, T: Float[Array, "v D D"], solve: Callable[[Array], Array]
+) -> Float[Array, "v D D"]:
+    """The poses after one step; `solve` finds tangents from logarithms (Eq. 20)."""
+    tangent = solve(lie.log(graph.residual_motions(T)))
+    return nearby_rotation(product(lie.exp(tangent), T))
+
+
+def averaging_gradients(
+    graph: PoseGraph, end: Iterated, trust_of: TrustOf, rows_of: RowsOf
+) -> Iterated:
+    """The same result with derivatives by the balance of flows at the fixed point.
+
+    `trust_of` is a pytree of the values that it uses.
+    """
+    fixed = jax.lax.stop_gradient(graph)
+    held = rows_of(fixed, end.trust)
+    top = jnp.max(held)
+    top = jnp.where(top > 0, top, 1)
+    imbalance = eqx.Partial(_net_flow, trust_of, rows_of, end.width, top)
+    T = differentiable(graph, end.T_world_i, imbalance, held / top)
+    return end._replace(T_world_i=T, trust=trust_of(graph, T, end.width))
+
+
+def _net_flow(
+    trust_of: TrustOf, rows_of: RowsOf, width: Array, top: Array, g: PoseGraph, T: Array
+) -> Array:
+    """What flows into each frame, by weights over the largest."""
+    weight = rows_of(g, trust_of(g, T, width)) / top
+    flow = weight[:, None] * lie.log(g.residual_motions(T))
+    return divergence(g.edges, flow, g.num_poses)
+
+
+def iterate(
+    graph: PoseGraph,
+    T_start: Float[Array, "v D D"],
+    width_start: Float[Array, "2"],
+    width_of: WidthOf,
+    trust_of: TrustOf,
+    step_of: Step,
+    *,
+    max_steps: int,
+    tolerance: Array | float,
+) -> Iterated:
+    """Alternates weights and steps until widths and poses stand still.
+
+    Stops when no rotation moves by more than `tolerance` radians, no position by more
+    than `tolerance` of the size of the scene, and no width shrinks by more than
+    a thousandth of itself, or after `max_steps`. Nothing is differentiable here; the
+    caller attaches the derivatives of the fixed point.
+    """
+    graph, T_start, width_start, tolerance = jax.lax.stop_gradient(
+        (graph, T_start, width_start, tolerance)
+    )
+    scale = length_scale(graph)
+    limit = jnp.maximum(tolerance, 32 * jnp.finfo(T_start.dtype).eps)
+
+    def unfinished(s: _State) -> Array:
+        return (s.change > limit) & (s.step < max_steps)
+
+    def step(s: _State) -> _State:
+        width = width_of(graph, s.T, s.width)
+        trust = trust_of(graph, s.T, width)
+        T = step_of(graph, s.T, trust, width)
+        moved = pose_change(s.T, T, scale)
+        trusted = weighted_mean(trust, graph.weight)
+        rows = with_row(s.rows, s.step, moved, width, trusted)
+        shrinking = jnp.any(width < 0.999 * s.width) & jnp.all(jnp.isfinite(s.width))
+        change = moved + jnp.where(shrinking, limit, 0)
+        return _State(T, width, change, s.step + 1, rows)
+
+    start = _State(
+        T=T_start,
+        width=width_start,
+        change=jnp.asarray(jnp.inf, T_start.dtype),
+        step=jnp.asarray(0, jnp.int32),
+        rows=no_rows(max_steps, T_start.dtype),
+    )
+    end = jax.lax.while_loop(unfinished, step, start)
+    trust = trust_of(graph, end.T, end.width)
+    trace = AveragingTrace.of(end.rows, end.step)
+    return Iterated(end.T, trust, end.width, end.change <= limit, end.step, trace)
+
+
+def pose_change(T_old: Array, T_new: Array, scale: Array) -> Array:
+    """The largest rotation (radians) or shift (over the size of the scene)."""
+    t_old, t_new = lie.translation(T_old), lie.translation(T_new)
+    spread = jnp.sqrt(
+        jnp.mean(jnp.sum((t_new - jnp.mean(t_new, axis=0)) ** 2, axis=-1))
+    )
+    turn = jnp.sqrt(jnp.sum((lie.rotation(T_new) - lie.rotation(T_old)) ** 2, (-2, -1)))
+    shift = jnp.sqrt(jnp.sum((t_new - t_old) ** 2, axis=-1)) / (scale + spread)
+    return jnp.maximum(jnp.max(turn), jnp.max(shift))

@@ -1,0 +1,1 @@
+"""Many problems of unequal sizes: padded, spread over cores, told of."""

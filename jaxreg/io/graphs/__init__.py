@@ -1,0 +1,1 @@
+"""Pose graphs and relative motions in files."""

@@ -1,0 +1,1 @@
+"""Point sets in files, one format a file."""

@@ -1,0 +1,269 @@
+"""Reading point sets: one entry point that goes by the suffix of the file."""
+
+import contextlib
+import os
+import re
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxreg.io.errors import InputError
+from jaxreg.io.points import arrays, e57, las, meshes, pcd, ply, text
+from jaxreg.io.points.content import require_suffix
+from jaxreg.io.points.thinning import (
+    Step,
+    at_most,
+    every_row,
+    is_packed,
+    open_bytes,
+    some_lines,
+)
+
+
+TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
+_PARSERS = {
+    ".npy": arrays.parse_npy,
+    ".ply": ply.parse_ply,
+    ".pcd": pcd.parse_pcd,
+    ".las": las.parse_las,
+    ".laz": las.parse_las,
+    ".obj": meshes.parse_obj,
+    ".stl": meshes.parse_stl,
+}
+_ARCHIVE_READERS = {".npz": arrays.parse_npz, ".e57": e57.read_e57}
+ARCHIVES = tuple(_ARCHIVE_READERS)
+SUFFIXES = (*_PARSERS, *ARCHIVES, *TEXT)
+_NEVER_PACKED = (".npy", *ARCHIVES, "")
+_FORMATS = (
+    "PLY, XYZ/CSV/TXT text, PCD, LAS/LAZ, OBJ, STL (each also .gz), E57, NPY, NPZ"
+)
+
+
+class NamedPoints(NamedTuple):
+    """Points as read.
+
+    Attributes:
+        points: `(n, d)` float32 or float64, rows with NaN or inf included.
+        fields: names of the columns or properties of the file, empty if it has none.
+        step: of how many rows of the file one was kept.
+    """
+
+    points: np.ndarray
+    fields: tuple[str, ...] = ()
+    step: int = 1
+
+
+def read_points(path: str | Path) -> np.ndarray:
+    """Reads one point set.
+
+        >>> import numpy as np, pathlib, tempfile
+        >>> from jaxreg import io
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "corner.ply"
+        >>> io.write_ply(path, np.eye(3, dtype=np.float32))
+        >>> io.read_points(path)
+        array([[1., 0., 0.],
+               [0., 1., 0.],
+               [0., 0., 1.]], dtype=float32)
+
+    PLY (binary or ASCII, through plyfile), PCD, LAS, LAZ, the vertices of OBJ and STL,
+    and text files; all of these may be compressed (`.gz`). Text is separated by commas,
+    semicolons or white space, with or without a header line; the first three numeric
+    columns are taken, or both if there are two. NPY, NPZ and E57; one scan of an NPZ or
+    E57 file that holds several is named as `FILE.npz:KEY`.
+
+    Args:
+        path: the file.
+
+    Returns:
+        `(n, d)` array, d = 2 or 3, float32 if the file holds float32, else float64 (as
+        for LAS, LAZ and E57), in the unit of the file. Rows with NaN or inf are kept.
+
+    Raises:
+        InputError: if the file is missing, unreadable, empty, or holds no points.
+        MissingExtraError: if the package that reads this kind is not installed: plyfile
+            of the extra `app`, or one of the extra `formats`.
+    """
+    bare, key = _split_key(path)
+    scans = read_named(path)
+    if len(scans) > 1:
+        raise InputError(
+            f"{bare}: holds {len(scans)} scans: {_listing(scans)}.\n"
+            f"Name one of them, for example {bare}:{next(iter(scans))}"
+        )
+    return next(iter(scans.values())).points
+
+
+def read_scans(
+    paths: str | Path | Iterable[str | Path],
+) -> tuple[list[str], list[np.ndarray]]:
+    """Reads scans from files, NPZ archives and folders, in the order given.
+
+    Args:
+        paths: each is a file as for `read_points`, an NPZ or E57 file of which every
+            scan is read, or a folder, of which all point files are read in natural
+            order (`scan2` before `scan10`).
+
+    Returns:
+        Names, made of file names without suffix or NPZ keys and unique, and as many
+        `(n_i, d)` arrays.
+
+    Raises:
+        InputError: as `read_points`, and if a folder holds no point file.
+    """
+    names: list[str] = []
+    scans: list[np.ndarray] = []
+    for path in [paths] if isinstance(paths, (str, Path)) else paths:
+        for file in point_files(path):
+            found = read_named(file)
+            names += found.keys()
+            scans += [scan.points for scan in found.values()]
+    return unique_names(names), scans
+
+
+def read_named(
+    path: str | Path, max_points: int | None = None
+) -> dict[str, NamedPoints]:
+    """Reads all scans of one file by name, that of the file if there is but one.
+
+    Args:
+        path: a file as for `read_points`, an archive with or without `:KEY`.
+        max_points: of scans with more, every so many rows are kept. The others never
+            are in memory together, but for compressed files (`.gz` that is not text,
+            `binary_compressed` PCD) and meshes of less than 100 MB.
+
+    Raises:
+        InputError: as `read_points`.
+    """
+    bare, key = _split_key(path)
+    if _suffix(bare) not in ARCHIVES:
+        return {stem(bare): _read_file(bare, max_points)}
+    step = every_row if max_points is None else at_most(max_points)
+    found = _read_archive(bare, step)
+    scans = {name: _thinned(scan, max_points) for name, scan in found.items()}
+    if key is None and len(scans) == 1 and _suffix(bare) == ".e57":
+        return {stem(bare): next(iter(scans.values()))}  # scanners name all alike
+    if key is not None and key not in scans:
+        raise InputError(f"{bare}: has no scan {key}.\nIt holds: {_listing(scans)}.")
+    return scans if key is None else {key: scans[key]}
+
+
+def point_files(path: str | Path) -> list[Path]:
+    """The point files of a folder in natural order; a file stands for itself.
+
+    Raises:
+        InputError: if a folder holds no point file.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    files = [
+        f
+        for f in path.iterdir()
+        if f.is_file() and not f.name.startswith(".") and _suffix(f) in SUFFIXES
+    ]
+    if not files:
+        raise InputError(
+            f"{path}: the folder holds no point files.\nWanted {_FORMATS}."
+        )
+    return sorted(files, key=lambda f: _natural(f.name))
+
+
+def stem(path: str | Path) -> str:
+    """The name of a file without its folder and without `.ply`, `.ply.gz` and such.
+
+    Bytes that are no UTF-8 are spelled out in ASCII, so that the name can be written.
+    """
+    name = os.fsencode(Path(path).name).decode("utf-8", "backslashreplace")
+    name = name[:-3] if name.lower().endswith(".gz") else name
+    return name[: -len(Path(name).suffix)] if Path(name).suffix else name
+
+
+def _read_file(path: Path, max_points: int | None) -> NamedPoints:
+    suffix = _suffix(path)
+    if suffix not in SUFFIXES and path.exists():
+        raise InputError(
+            f"{path}: unknown kind of file {suffix or '(no suffix)'}.\n"
+            f"Wanted {_FORMATS}."
+        )
+    require_suffix(_read_bytes(path, 16), suffix, path)
+    if suffix in TEXT:
+        with _reading(path):
+            data, every = (
+                some_lines(path) if max_points is not None else (_read_bytes(path), 1)
+            )
+        found = NamedPoints(text.parse_text(data, path), text.columns(data), every)
+    else:
+        data = _read_bytes(path) if is_packed(path) else None
+        step = every_row if max_points is None else at_most(max_points)
+        found = NamedPoints(*_PARSERS[suffix](data, path, step))
+    return _thinned(found, max_points)
+
+
+def _thinned(scan: NamedPoints, max_points: int | None) -> NamedPoints:
+    step = 1 if max_points is None else at_most(max_points)(len(scan.points))
+    points = scan.points if step == 1 else scan.points[::step].copy()
+    return scan._replace(points=points, step=step * scan.step)
+
+
+def _read_archive(path: Path, step: Step) -> dict[str, NamedPoints]:
+    suffix = _suffix(path)
+    require_suffix(_read_bytes(path, 16), suffix, path)
+    found = _ARCHIVE_READERS[suffix](path, step)
+    return {name: NamedPoints(*scan) for name, scan in found.items()}
+
+
+def _read_bytes(path: Path, limit: int = -1) -> bytes:
+    with _reading(path), open_bytes(path) as file:
+        data = file.read(limit)
+    if not data:
+        raise InputError(f"{path}: the file is empty.\nExport or copy the scan again.")
+    return data
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Says what is wrong with a file that cannot be read."""
+    try:
+        yield
+    except FileNotFoundError as err:
+        raise InputError(f"{path}: no such file.\nCheck the name and folder.") from err
+    except (OSError, EOFError, zlib.error) as err:
+        reason = getattr(err, "strerror", None) or "damaged gzip data"
+        raise InputError(
+            f"{path}: cannot be read ({reason}).\nCheck the file and its permissions."
+        ) from err
+
+
+def _split_key(path: str | Path) -> tuple[Path, str | None]:
+    match = re.fullmatch(r"(.*\.(?:npz|e57)):([^/\\]+)", str(path), re.IGNORECASE)
+    return (Path(match[1]), match[2]) if match else (Path(path), None)
+
+
+def _suffix(path: Path) -> str:
+    name = path.name.lower()
+    packed = name.endswith(".gz")
+    suffix = Path(name[:-3] if packed else name).suffix
+    return suffix + ".gz" if packed and suffix in _NEVER_PACKED else suffix
+
+
+def _natural(name: str) -> list[tuple[int, int | str]]:
+    parts = re.split(r"(\d+)", name.lower())
+    return [(0, int(p)) if p.isdigit() else (1, p) for p in parts if p]
+
+
+def unique_names(names: list[str]) -> list[str]:
+    """The same names, later ones of a kind with -2, -3 and so on appended."""
+    seen: dict[str, int] = {}
+    out: list[str] = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        out.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
+    return out
+
+
+def _listing(scans: dict[str, NamedPoints]) -> str:
+    names = list(scans)
+    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")

@@ -1,0 +1,1 @@
+"""Trajectories and poses in files."""

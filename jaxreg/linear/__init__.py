@@ -1,0 +1,1 @@
+"""Linear systems of graphs: Laplacians, multigrid, conjugate gradients; arrays only."""

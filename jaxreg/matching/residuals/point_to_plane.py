@@ -1,0 +1,48 @@
+"""Point to plane; point to line in 2D."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg._core.arrays import traced
+from jaxreg.matching.problem import Match
+from jaxreg.matching.residuals.base import AbstractResidual
+from jaxreg.matching.residuals.gram import along, half_sum, weighted_gram
+from jaxreg.matching.residuals.point_to_point import PointToPoint
+
+
+class PointToPlane(AbstractResidual):
+    """n . (q - (R p + t)) with the target's normal (Chen and Medioni 1992).
+
+    In 2D, point-to-line. A small share of the point-to-point residual holds the
+    directions in which a flat surface slides; with a share of zero they are free.
+
+    Attributes:
+        point_share: weight of the point-to-point residual beside it.
+    """
+
+    uses_normals: ClassVar[bool] = True
+    point_share: Array | float = traced(0.05)
+
+    def normal_equations(
+        self, match: Match, weight: Float[Array, " n"]
+    ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
+        """The Gram matrix of rows (n, x cross n, n . r), plus the share of points."""
+        rows = along(match.normal, match)
+        gram = weighted_gram(rows, weight)
+        H, b = PointToPoint().normal_equations(match, weight)
+        share = jnp.asarray(self.point_share, H.dtype)
+        return gram[:-1, :-1] + share * H, gram[:-1, -1] + share * b
+
+    def descents(self, match: Match) -> Float[Array, "k n"]:
+        """Rows (n, x cross n) times n . r, plus the share of points."""
+        rows = along(match.normal, match)
+        share = jnp.asarray(self.point_share, rows.dtype)
+        return rows[:-1] * rows[-1] + share * PointToPoint().descents(match)
+
+    def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
+        """Sum of w ((n . r)^2 + point_share |r|^2) / 2."""
+        share = jnp.asarray(self.point_share, weight.dtype)
+        plane = match.plane_residual
+        return half_sum(plane * plane + share * match.sq_residual, weight)

@@ -1,0 +1,96 @@
+"""Whether two surfaces that agree can slip along each other."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core.typing import Motion, Motions, Scalar
+from jaxreg.geometry import lie
+from jaxreg.matching.problem import Match, Problem, match
+from jaxreg.matching.residuals import PointToPlane, PointToPoint
+from jaxreg.matching.score import agreeing
+
+
+# Planes that the gentlest motion by one radian, or radius, moves less than this many
+# radii do not hold a pose. (Right pairs of scans have 0.09 and more; the side of a limb
+# that fits another limb 0.02 to 0.06.)
+_HELD = 0.07
+
+
+class Grip(eqx.Module):
+    """How firmly surfaces that agree hold each other; sums, so that grips add up.
+
+    As a surface of revolution turns in itself, and a plane slides. The squared motion
+    of the planes is J^T J with J = (n, x cross n); its least eigenvalue, about their
+    middle, is that of the gentlest motion (Gelfand, Ikemoto, Rusinkiewicz, Levoy:
+    Geometrically stable sampling for the ICP algorithm, 2003). Points that have no
+    normals hold every direction.
+
+    Attributes:
+        H: `(..., k, k)` sum of J^T J, about the origin of the frame.
+        x: `(..., d)` sum of the points.
+        count: `(...)` how many.
+    """
+
+    H: Float[Array, "*b k k"]
+    x: Float[Array, "*b d"]
+    count: Float[Array, "*b"]
+
+    @classmethod
+    def of(cls, found: Match, points: Float[Array, "d n"], share: Array) -> "Grip":
+        """Of the points in `share`, where they are in the frame of the normals."""
+        found = eqx.tree_at(lambda m: m.rotated, found, points)
+        weight = share.astype(points.dtype)
+        flat = jnp.any(found.normal != 0, axis=0)
+        H, _ = PointToPlane(0.0).normal_equations(found, weight * flat)
+        H = H + PointToPoint().normal_equations(found, weight * ~flat)[0]
+        return cls(H, jnp.sum(weight * points, axis=1), jnp.sum(weight))
+
+    def seen_from(self, T_to_here: Motions) -> "Grip":
+        """In another frame."""
+        A = lie.adjoint(lie.inverse(T_to_here))
+        x = jnp.einsum("...ij,...j->...i", lie.rotation(T_to_here), self.x)
+        x = x + self.count[..., None] * lie.translation(T_to_here)
+        return Grip(jnp.swapaxes(A, -1, -2) @ self.H @ A, x, self.count)
+
+    @property
+    def holds(self) -> Bool[Array, "*b"]:
+        """Whether every motion moves some planes; in frames of unit radius."""
+        count = jnp.maximum(self.count, 1)
+        middle = self.x / count[..., None]
+        batch, d = middle.shape[:-1], middle.shape[-1]
+        turn = lie.rotation(lie.identity(d, middle.dtype, batch))
+        H = self.seen_from(lie.compose(turn, -middle)).H / count[..., None, None]
+        return (self.count > 0) & _exceeds(H, _HELD**2)
+
+
+def can_slip(
+    problem: Problem, T_target_source: Motion, spacing: Scalar
+) -> Bool[Array, ""]:
+    """Whether some motion leaves the agreeing surfaces nearly in place.
+
+    Args:
+        problem: in frames whose unit is the radius of the clouds.
+        T_target_source: the pose.
+        spacing: distance between samples of the coarser cloud.
+    """
+    found = match(problem, T_target_source)
+    return ~Grip.of(found, found.rotated, agreeing(found, spacing)).holds
+
+
+def _exceeds(H: Float[Array, "*b k k"], least: float) -> Bool[Array, "*b"]:
+    """Whether all eigenvalues are larger: all pivots of H - least I are positive.
+
+    By Sylvester's law of inertia; elementwise, where LAPACK goes matrix by matrix.
+    """
+    k = H.shape[-1]
+    A = [[H[..., i, j] - least * (i == j) for j in range(k)] for i in range(k)]
+    positive = jnp.ones(H.shape[:-2], bool)
+    for i in range(k):
+        positive &= A[i][i] > 0
+        inverse = 1 / jnp.where(A[i][i] > 0, A[i][i], 1)
+        for j in range(i + 1, k):
+            ratio = A[j][i] * inverse
+            for m in range(i + 1, j + 1):
+                A[j][m] = A[j][m] - ratio * A[m][i]
+    return positive

@@ -1,0 +1,118 @@
+"""What `reconstruct` takes, checked and padded."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core.checks import (
+    as_float_array,
+    check_mask,
+    check_points,
+    is_concrete,
+)
+from jaxreg.batching.padding import rounded_up, stacked
+
+
+# A viewpoint lies on a point if it is nearer than this share of the scan's extent.
+_ON_POINT = 1e-6
+# Scans are thinned to some thousand points; of very large ones so many are enough.
+_MOST_POINTS = 1 << 19
+
+
+def padded_scans(scans: object, mask: object) -> tuple[Array, Array]:
+    """Scans as `(v, n, d)` with a mask; points of very large ones in a list drawn."""
+    if isinstance(scans, Sequence):
+        if mask is not None:
+            raise ValueError("mask: only for a padded array, not for a list of scans.")
+        arrays = [as_float_array(x, f"scans[{i}]") for i, x in enumerate(scans)]
+        for i, x in enumerate(arrays):
+            check_points(x, f"scans[{i}]")
+            if x.ndim != 2 or x.shape[1] != arrays[0].shape[1]:
+                raise ValueError(
+                    f"scans[{i}]: wanted shape (n, {arrays[0].shape[-1]}) like "
+                    f"scans[0], found {x.shape}."
+                )
+        if len(arrays) < 2:
+            raise ValueError(f"scans: wanted two or more, found {len(arrays)}.")
+        arrays = [_drawn(x) for x in arrays]
+        dtype = jnp.result_type(*arrays)
+        lengths = np.array([len(x) for x in arrays])
+        rows = rounded_up(max(lengths.tolist()))
+        row_mask = jnp.asarray(np.arange(rows) < lengths[:, None])
+        return stacked([x.astype(dtype) for x in arrays], rows), row_mask
+    points = as_float_array(scans, "scans")
+    check_points(points, "scans")
+    if points.ndim != 3 or points.shape[0] < 2:
+        raise ValueError(
+            "scans: wanted a list of two or more (n, d) arrays or a padded array "
+            f"(v, n, d), found shape {points.shape}."
+        )
+    return points, check_mask(mask, points.shape[:2], "mask")
+
+
+def _drawn(points: Float[Array, "n d"]) -> Float[Array, "m d"]:
+    """All points, or as many at random as are enough; the same ones every time."""
+    n = len(points)
+    if n <= _MOST_POINTS:
+        return points
+    return points[np.sort(np.random.default_rng(n).permutation(n)[:_MOST_POINTS])]
+
+
+def checked_viewpoints(
+    viewpoints: object, points: Float[Array, "v n d"], mask: Bool[Array, "v n"]
+) -> Float[Array, "v d"] | None:
+    """Where the scanners stood, NaN where that is not known; None if of no scan.
+
+    Raises:
+        ValueError: for another shape, for numbers that are not finite, and where a
+            viewpoint is one of the points, as of rows that stand for missing returns.
+    """
+    if viewpoints is None:
+        return None
+    num, _, d = points.shape
+    if isinstance(viewpoints, Sequence):
+        unknown = np.array([x is None for x in viewpoints], bool)
+        rows = [
+            jnp.zeros(d) if x is None else as_float_array(x, f"viewpoints[{i}]")
+            for i, x in enumerate(viewpoints)
+        ]
+        for i, x in enumerate(rows):
+            if x.shape != (d,):
+                raise ValueError(
+                    f"viewpoints[{i}]: wanted shape ({d},) or None, found {x.shape}."
+                )
+        eyes = jnp.stack(rows) if rows else jnp.zeros((0, d))
+    else:
+        eyes = as_float_array(viewpoints, "viewpoints")
+        unknown = np.zeros(len(eyes) if eyes.ndim else 0, bool)
+    if eyes.shape != (num, d):
+        raise ValueError(
+            f"viewpoints: wanted one of shape ({d},) for each of {num} scans, found "
+            f"shape {eyes.shape}."
+        )
+    if is_concrete(eyes) and is_concrete(points) and is_concrete(mask):
+        _check_apart(np.asarray(eyes), unknown, np.asarray(points), np.asarray(mask))
+    return jnp.where(unknown[:, None], jnp.nan, eyes.astype(points.dtype))
+
+
+def _check_apart(
+    eyes: np.ndarray, unknown: np.ndarray, points: np.ndarray, mask: np.ndarray
+) -> None:
+    for i in np.flatnonzero(~unknown):
+        if not np.all(np.isfinite(eyes[i])):
+            raise ValueError(
+                f"viewpoints[{i}]: wanted finite numbers, found {eyes[i].tolist()}; "
+                "give None where a viewpoint is not known."
+            )
+        valid = np.flatnonzero(mask[i] & np.all(np.isfinite(points[i]), axis=1))
+        if not len(valid):
+            continue
+        distance = np.linalg.norm(points[i, valid] - eyes[i], axis=1)
+        row = np.argmin(distance)
+        if distance[row] <= _ON_POINT * np.max(distance):
+            raise ValueError(
+                f"viewpoints[{i}]: is a point of the scan, row {valid[row]}. Leave out "
+                "rows that stand for missing returns."
+            )

@@ -1,0 +1,119 @@
+"""From the motions of pairs to the answer: poses, statuses, trust."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.compile import compiled
+from jaxreg._core.status import Status
+from jaxreg._core.typing import Scalar
+from jaxreg.averaging import AbstractAverager
+from jaxreg.geometry import lie
+from jaxreg.graph import PoseGraph
+from jaxreg.multiview.find_slipping import slipping
+from jaxreg.multiview.find_turnable import turnable
+from jaxreg.multiview.hold_poses import Held
+from jaxreg.multiview.place import Placement, displacement, place
+from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.refine import refine
+from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.solution import ReconstructionSolution
+from jaxreg.particle import ParticleFilter
+
+
+def finish(
+    method: ParticleFilter,
+    averaging: AbstractAverager | None,
+    scans: PreparedScans,
+    motions: RelativeMotions,
+    hold: Held | None = None,
+) -> ReconstructionSolution:
+    """Averages, refines, and returns to the frames and unit of the input.
+
+    Args:
+        method: its `min_overlap` tells which pairs are believed.
+        averaging: see `place`.
+        scans: prepared scans.
+        motions: of pairs, in the scans' centred frames; some may be padding.
+        hold: old frames that stay, or None.
+    """
+    min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
+    placement = place(motions, scans.num_scans, averaging, min_overlap)
+    mode, turns = placement.mode, turnable(motions, placement)
+    placement = refine(scans, placement, averaging, min_overlap / 2)
+    if hold is None:
+        free = turns | slipping(scans, placement, min_overlap)
+        return _solution(scans, motions, mode, placement, free, min_overlap)
+    placement = hold.place(scans, placement, averaging, min_overlap / 2)
+    free = (turns | slipping(scans, placement, min_overlap)) & ~hold.held
+    solution = _solution(scans, motions, mode, placement, free, min_overlap)
+    return hold.in_world(solution)
+
+
+@compiled
+def _solution(
+    scans: PreparedScans,
+    motions: RelativeMotions,
+    mode: Int[Array, " e"],
+    placement: Placement,
+    free: Bool[Array, " v"],
+    min_overlap: Scalar,
+) -> ReconstructionSolution:
+    """In the frames and unit of the input."""
+    found = motions.in_input_frames(scans)
+    one = found.of_modes(mode)
+    overlap, T_i_j = one.overlap[:, 0], one.T_i_j[:, 0]
+    weight = jnp.where(overlap >= min_overlap, overlap, 0)
+    real = motions.pairs[:, 0] != motions.pairs[:, 1]
+    graph = PoseGraph(found.pairs, T_i_j, weight, real, None, scans.num_scans)
+    component, placed = placement.component, placement.placed
+    scan_status = jnp.where(component < 0, Status.LOW_OVERLAP, Status.DISCONNECTED)
+    scan_status = jnp.where(placed, Status.CONVERGED, scan_status)
+    scan_status = jnp.where(free & (component >= 0), Status.AMBIGUOUS, scan_status)
+    scan_status = jnp.where(scans.usable, scan_status, scans.fault)
+    status = jnp.where(jnp.any(free & placed), Status.AMBIGUOUS, Status.CONVERGED)
+    status = jnp.where(jnp.all(placed), status, Status.DISCONNECTED)
+    trace = placement.trace
+    return ReconstructionSolution(
+        T_world_i=_in_first_frames(scans, placement),
+        status=status.astype(jnp.int32),
+        scan_status=scan_status.astype(jnp.int32),
+        placed=placed,
+        component=component,
+        graph=graph,
+        overlap=overlap,
+        edge_weight=_trust(scans, motions.of_modes(mode), placement, weight),
+        inlier_rmse=one.inlier_rmse[:, 0],
+        mode=mode,
+        motions=found,
+        num_dropped=scans.num_dropped,
+        trace=None if trace is None else trace.in_unit(scans.radius),
+    )
+
+
+def _trust(
+    scans: PreparedScans,
+    motions: RelativeMotions,
+    placement: Placement,
+    weight: Float[Array, " e"],
+) -> Float[Array, " e"]:
+    """Agreement of one motion of each pair with the poses; the radius is one."""
+    i, j = motions.pairs[:, 0], motions.pairs[:, 1]
+    T_world_i = placement.T_world_i
+    T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
+    turn, shift = displacement(T_i_j, motions.T_i_j[:, 0])
+    sq = turn**2 + shift**2
+    spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
+    trust = jnp.exp(-sq / (2 * jnp.maximum(spacing, 1e-6) ** 2))
+    return jnp.where((weight > 0) & placement.together(i, j), trust, 0)
+
+
+def _in_first_frames(
+    scans: PreparedScans, placement: Placement
+) -> Float[Array, "v D D"]:
+    """Poses relative to the first scan of each part, in the input's frames and unit."""
+    first = placement.part
+    ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
+    T_first_i = lie.inverse(placement.T_world_i[first]) @ placement.T_world_i
+    T = scans.to_input_frames(T_first_i, first, ids)
+    eye = jnp.eye(T.shape[-1], dtype=T.dtype)
+    return jnp.where((ids != first)[:, None, None], T, eye)

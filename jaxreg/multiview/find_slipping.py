@@ -1,0 +1,76 @@
+"""Which scans the surfaces hold in place, and which can slip along the others.
+
+Pairs whose surfaces hold each other make bodies. What one pair leaves free another may
+hold, so two bodies that are not held by one pair may be by all of theirs together, and
+then are one; and so on.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Int
+
+from jaxreg._core.compile import compiled
+from jaxreg._core.typing import Scalar
+from jaxreg.geometry import lie
+from jaxreg.graph.trees import components
+from jaxreg.matching import Grip, Problem, agreeing, match
+from jaxreg.multiview.place import Placement, in_main_body
+from jaxreg.multiview.prepare import PreparedScans
+
+
+@compiled
+def slipping(
+    scans: PreparedScans, placement: Placement, min_overlap: Scalar
+) -> Bool[Array, " v"]:
+    """`(v,)` scans that can move along the main body of their part.
+
+    Args:
+        scans: prepared scans.
+        placement: their final poses.
+        min_overlap: of the pairs that count.
+    """
+    pairs = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
+    body = _bodies(pairs, _grips(scans, placement, pairs, min_overlap), scans.num_scans)
+    return ~in_main_body(body, placement.part)
+
+
+def _grips(
+    scans: PreparedScans,
+    placement: Placement,
+    pairs: Int[Array, "e 2"],
+    min_overlap: Scalar,
+) -> Grip:
+    """Of every pair that overlaps, in the world's frame; nothing of the others."""
+    T_world_i = placement.T_world_i
+
+    def one(pair: Array) -> Grip:
+        i, j = pair
+        T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
+        problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
+        found = match(problem, T_i_j)
+        share = agreeing(found, scans.coarsest)
+        enough = jnp.sum(share) >= min_overlap * jnp.sum(found.mask)
+        use = enough & placement.together(i, j)
+        points = found.rotated + lie.translation(T_i_j)[:, None]
+        return Grip.of(found, points, share & use).seen_from(T_world_i[i])
+
+    return lax.map(one, pairs)
+
+
+def _bodies(pairs: Int[Array, "e 2"], grips: Grip, num_scans: int) -> Int[Array, " v"]:
+    """The lowest number of the scans of each scan's body."""
+
+    def between(body: Int[Array, " v"]) -> Bool[Array, " e"]:
+        a, b = body[pairs[:, 0]], body[pairs[:, 1]]
+        row = jnp.minimum(a, b) * num_scans + jnp.maximum(a, b)
+        sums = jax.tree.map(lambda x: jax.ops.segment_sum(x, row, num_scans**2), grips)
+        return sums.holds[row] | (a == b)
+
+    def joined(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        body, _ = state
+        new = components(pairs, between(body).astype(grips.count.dtype), num_scans)
+        return new, jnp.any(new != body)
+
+    start = jnp.arange(num_scans, dtype=jnp.int32)
+    return lax.while_loop(lambda s: s[1], joined, (start, jnp.asarray(True)))[0]

@@ -1,0 +1,30 @@
+"""Which scans could as well lie otherwise: on symmetric objects, by a finite turn.
+
+A pair of which another mode overlaps as much as the best settles nothing. Pairs that
+are settled make bodies; scans that only the others join to them may be elsewhere.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from jaxreg._core.compile import compiled
+from jaxreg.graph.trees import components
+from jaxreg.multiview.place import Placement, believed, in_main_body
+from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.particle.conclude import RIVAL_OVERLAP
+
+
+@compiled
+def turnable(motions: RelativeMotions, placement: Placement) -> Bool[Array, " v"]:
+    """`(v,)` scans that no settled pairs join to the main body of their part.
+
+    Args:
+        motions: modes of the pairs.
+        placement: what was made of them.
+    """
+    best = motions.overlap[:, :1]
+    rival = jnp.any(motions.overlap[:, 1:] > RIVAL_OVERLAP * best, axis=1)
+    settled = believed(placement.edge_weight) & ~rival
+    part = placement.part
+    body = components(motions.pairs, settled.astype(best.dtype), part.shape[0])
+    return ~in_main_body(body, part)

@@ -1,0 +1,73 @@
+"""Pairs of a sequence: the motion goes on as before, or else it is searched for.
+
+A scanner that moves on moves much as it did a scan ago, so a descent from that motion
+finds most pairs of a sequence in a fraction of a search. What it finds is believed at
+once only if it overlaps by so much as no chance does; else it competes with the search.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxreg._core.arrays import cast_floats
+from jaxreg._core.compile import compiled
+from jaxreg.geometry import lie
+from jaxreg.local import GaussNewton, LocalOptimiser
+from jaxreg.matching import PlaneToPlane, Problem, mutual_overlap, score_both_ways
+from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.particle import ParticleFilter
+
+
+#: Overlap from which no search competes with a motion.
+SURE = 0.5
+# Steps from the first kernel width of the search to the sample spacing, and there in
+# the metric of both surfaces.
+_STEPS, _POLISH = 24, 8
+
+
+@compiled
+def descended(
+    method: ParticleFilter,
+    scans: PreparedScans,
+    pairs: Int[Array, "e 2"],
+    T_i_j: Float[Array, "e D D"],
+) -> RelativeMotions:
+    """Motions by descents from guesses, in the scans' centred frames, m = 1."""
+    widest, dtype = method.width_start, T_i_j.dtype
+    coarse = LocalOptimiser(method.residual, method.kernel, method.step)
+    fine = LocalOptimiser(PlaneToPlane(0.01), method.kernel, GaussNewton())
+    coarse, fine = cast_floats((coarse, fine), dtype)
+
+    def one(row: tuple[Array, Array]) -> RelativeMotions:
+        (i, j), T = row
+        clouds = scans.cloud(j), scans.cloud(i), scans.table(j), scans.table(i)
+        problem = Problem.of(clouds[0], clouds[1], clouds[3])
+        spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
+        widths = jnp.geomspace(widest, 0.5 * spacing, _STEPS).astype(dtype)
+        T = lie.orthonormalise(coarse.repeat(problem, T, widths))
+        there, back = score_both_ways(*clouds, T[None], jnp.ones(1, bool), spacing)
+        T = fine.repeat(problem, T, jnp.full(_POLISH, 0.5 * spacing, dtype))
+        sound = scans.usable[i] & scans.usable[j] & jnp.all(jnp.isfinite(T))
+        return RelativeMotions(
+            row[0],
+            jnp.where(sound, lie.orthonormalise(T), jnp.eye(len(T), dtype=dtype))[None],
+            jnp.where(sound, mutual_overlap(there, back), 0),
+            there.inlier_rmse,
+        )
+
+    return lax.map(one, (pairs, T_i_j))
+
+
+def descended_in_input_frames(
+    method: ParticleFilter,
+    scans: PreparedScans,
+    pair: tuple[int, int],
+    T_i_j: np.ndarray,
+) -> RelativeMotions:
+    """One pair, by a descent from a guess in the input's frames and unit."""
+    pairs = jnp.array([pair], jnp.int32)
+    guess = jnp.asarray(T_i_j, scans.mean.dtype)[None]
+    guess = scans.to_centred_frames(guess, pairs[:, 0], pairs[:, 1])
+    return descended(method, scans, pairs, guess)

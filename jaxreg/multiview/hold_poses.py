@@ -1,0 +1,130 @@
+"""New scans beside old ones whose poses are held.
+
+The old frames are one body: motions between them count no more, and those of new scans
+to any of them say where the new scan lies in the old world.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.compile import compiled
+from jaxreg._core.typing import Scalar
+from jaxreg.averaging import AbstractAverager
+from jaxreg.geometry import lie
+from jaxreg.multiview.place import Placement, place
+from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.refine import measured, wide_unless_given
+from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.solution import ReconstructionSolution
+
+
+class Held(eqx.Module):
+    """Poses that stay.
+
+    Attributes:
+        T_world_i: `(v, d+1, d+1)` in the input's frames and unit, the identity for the
+            others.
+        held: `(v,)` which scans stay.
+        node: `(v,)` int32, 0 for these, and a number for each other scan.
+    """
+
+    T_world_i: Float[Array, "v D D"]
+    held: Bool[Array, " v"]
+    node: Int[Array, " v"]
+
+    @classmethod
+    def of(cls, previous: ReconstructionSolution, num_scans: int) -> "Held":
+        """The placed scans of an earlier solution of the first of these scans."""
+        more = num_scans - previous.num_scans
+        held = np.pad(np.asarray(previous.placed), (0, more))
+        T = np.asarray(previous.T_world_i)
+        T = np.concatenate(
+            [T, np.tile(np.eye(T.shape[-1], dtype=T.dtype), (more, 1, 1))]
+        )
+        node = np.where(held, 0, np.cumsum(~held)).astype(np.int32)
+        return cls(jnp.asarray(T), jnp.asarray(held), jnp.asarray(node))
+
+    def place(
+        self,
+        scans: PreparedScans,
+        found: Placement,
+        averaging: AbstractAverager | None,
+        min_overlap: Scalar,
+    ) -> Placement:
+        """The others beside those that stay.
+
+        Args:
+            scans: prepared scans.
+            found: where all of them lie, none held.
+            averaging: as in `place`.
+            min_overlap: of the pairs that count.
+        """
+        before = _brought(self, scans, found)
+        motions = measured(scans, before, min_overlap, exact=True)
+        num_nodes = 1 + int(np.max(np.asarray(self.node)))
+        motions = _contracted(self, before, motions)
+        nodes = place(motions, num_nodes, wide_unless_given(averaging), min_overlap)
+        return _expanded(self, before, nodes)
+
+    def in_world(self, solution: ReconstructionSolution) -> ReconstructionSolution:
+        """A solution in the world of those that stay, which have their very poses."""
+        one = jnp.argmax(self.held)
+        T_one_i = lie.inverse(solution.T_world_i[one]) @ solution.T_world_i
+        T = jnp.where(
+            solution.placed[:, None, None],
+            self.T_world_i[one] @ T_one_i,
+            solution.T_world_i,
+        )
+        T = jnp.where(self.held[:, None, None], self.T_world_i, T)
+        return eqx.tree_at(lambda s: s.T_world_i, solution, T)
+
+
+@compiled
+def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
+    """With the held poses; each other scan follows the held one nearest to it."""
+    ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
+    one = jnp.argmax(hold.held).astype(jnp.int32)
+    T_one_i = lie.inverse(hold.T_world_i[one]) @ hold.T_world_i
+    T_held = scans.to_centred_frames(T_one_i, jnp.full_like(ids, one), ids)
+    centre = lie.translation(found.T_world_i)
+    far = jnp.sum((centre[:, None] - centre[None, :]) ** 2, axis=-1)
+    beside = hold.held[None, :] & (found.part[:, None] == found.part[None, :])
+    near = jnp.argmin(jnp.where(beside, far, jnp.inf), axis=1)
+    T_near_i = lie.inverse(found.T_world_i[near]) @ found.T_world_i
+    stays = hold.held | ~jnp.any(beside, axis=1)
+    T = jnp.where(hold.held[:, None, None], T_held, T_held[near] @ T_near_i)
+    T = jnp.where((stays & ~hold.held)[:, None, None], found.T_world_i, T)
+    with_held = hold.held | jnp.any(beside, axis=1)
+    part = jnp.where(with_held, jnp.argmax(with_held).astype(jnp.int32), found.part)
+    return eqx.tree_at(lambda p: (p.T_world_i, p.part), found, (T, part))
+
+
+@compiled
+def _contracted(
+    hold: Held, before: Placement, motions: RelativeMotions
+) -> RelativeMotions:
+    """Motions between nodes; the frame of node 0 is the world."""
+    i, j = motions.pairs[:, 0], motions.pairs[:, 1]
+    T = before.T_world_i
+    T = jnp.where(hold.held[:, None, None], T, jnp.eye(T.shape[-1], dtype=T.dtype))
+    within = hold.held[i] & hold.held[j]
+    return RelativeMotions(
+        hold.node[motions.pairs],
+        T[i][:, None] @ motions.T_i_j @ lie.inverse(T[j])[:, None],
+        jnp.where(within[:, None], 0, motions.overlap),
+        motions.inlier_rmse,
+    )
+
+
+@compiled
+def _expanded(hold: Held, before: Placement, nodes: Placement) -> Placement:
+    """Poses of the scans by those of the nodes."""
+    beside = nodes.together(hold.node, jnp.zeros_like(hold.node))
+    T = (lie.inverse(nodes.T_world_i[0]) @ nodes.T_world_i)[hold.node]
+    moves = (beside & ~hold.held)[:, None, None]
+    T = jnp.where(moves, T, before.T_world_i)
+    ids = jnp.arange(len(beside), dtype=jnp.int32)
+    part = jnp.where(beside, jnp.argmax(beside).astype(jnp.int32), ids)
+    return eqx.tree_at(lambda p: (p.T_world_i, p.part), before, (T, part))

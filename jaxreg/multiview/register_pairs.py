@@ -1,0 +1,199 @@
+"""Registers pairs of scans round by round, each chosen by what the last ones say."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxreg._core.compile import compiled
+from jaxreg._core.typing import Key, Progress
+from jaxreg.averaging import AbstractAverager
+from jaxreg.batching.threads import map_in_threads
+from jaxreg.geometry import lie
+from jaxreg.matching import Problem, score
+from jaxreg.multiview.choose_pairs import Order, first_pairs, most_pairs, next_pairs
+from jaxreg.multiview.follow_sequence import SURE, descended_in_input_frames
+from jaxreg.multiview.place import Placement, believed, place
+from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.relative_motions import (
+    RelativeMotions,
+    num_kept,
+    relative_motions,
+)
+from jaxreg.particle import ParticleFilter
+
+
+# What a run keeps: motions of pairs as they are found, in the input's frames.
+OnPairs = Callable[[RelativeMotions], None]
+
+_PAIRS_PER_BATCH, _THREADS = 4, 2
+# Poses of a chain drift: surfaces this many spacings apart may still be one.
+_DRIFT = 6.0
+
+
+class Rounds:
+    """The pairs that were registered so far, and how to register more.
+
+    Args:
+        method, averaging: as in `reconstruct`.
+        scans: prepared scans.
+        key: of the pairs, and of those drawn at random.
+        known: motions that need not be found again, in the scans' centred frames.
+        on_pairs: told of every batch, or None.
+        report: told of progress.
+    """
+
+    def __init__(
+        self,
+        method: ParticleFilter,
+        averaging: AbstractAverager | None,
+        scans: PreparedScans,
+        key: Key,
+        known: RelativeMotions | None,
+        on_pairs: OnPairs | None,
+        report: Progress,
+    ) -> None:
+        self.method, self.averaging, self.scans = method, averaging, scans
+        self.key, self.on_pairs, self.report = key, on_pairs, report
+        self.known, self.row = known, {}
+        if known is not None:
+            self.known = known.with_modes(num_kept(method))
+            ids = map(tuple, np.asarray(known.pairs).tolist())
+            self.row = {pair: row for row, pair in enumerate(ids)}
+        self.tried = np.zeros((scans.num_scans,) * 2, bool)
+        self.found: list[RelativeMotions] = []
+        self.rivals: dict[tuple[int, int], RelativeMotions] = {}
+        self.most = most_pairs(scans.num_scans)
+
+    def run(self, order: Order, pairs: np.ndarray | None) -> RelativeMotions:
+        """All rounds; the motions, in ascending order of the scans.
+
+        Args:
+            order: of the scans, see `first_pairs`.
+            pairs: of the first round, or None.
+        """
+        bits = np.asarray(jax.random.key_data(self.key)).ravel()
+        rng = np.random.default_rng(bits)
+        if pairs is None:
+            pairs = first_pairs(self.scans.num_scans, order, rng)
+            if order == "sequential":
+                self._follow()
+        self.most = max(self.most, len(pairs))
+        while len(pairs):
+            self._register(pairs)
+            if self.num_tried >= self.most:
+                break
+            pairs = next_pairs(self.tried, *self._evidence(), rng)
+            pairs = pairs[: self.most - self.num_tried]
+        return RelativeMotions.joined(self.found)
+
+    @property
+    def num_tried(self) -> int:
+        """Pairs registered or known."""
+        return int(np.triu(self.tried).sum())
+
+    def _register(self, pairs: np.ndarray) -> None:
+        """The pairs in batches of one compiled size, two batches at a time."""
+        self.tried[pairs[:, 0], pairs[:, 1]] = True
+        self.tried |= self.tried.T
+        rows = [self.row.get(tuple(pair)) for pair in pairs.tolist()]
+        have = np.array([row for row in rows if row is not None], int)
+        if self.known is not None and len(have):
+            self.found.append(self.known.rows(jnp.asarray(have)))
+        pairs = pairs[[row is None for row in rows]]
+        total = self.num_tried
+        done = total - len(pairs)
+        self.report("registering pairs", done, total)
+        starts = range(0, len(pairs), _PAIRS_PER_BATCH)
+        if not starts:
+            return
+
+        def run(start: int) -> RelativeMotions:
+            rows = np.arange(start, start + _PAIRS_PER_BATCH)
+            batch = jnp.asarray(pairs[np.minimum(rows, len(pairs) - 1)])
+            out = relative_motions(self.method, self.scans, batch, self.key)
+            out = jax.block_until_ready(out).rows(
+                jnp.arange(min(_PAIRS_PER_BATCH, len(pairs) - start))
+            )
+            rivals = [self.rivals.get(tuple(pair)) for pair in out.pairs.tolist()]
+            return out.or_better(rivals)
+
+        for batch in map_in_threads(run, starts, _THREADS):
+            self.found.append(batch)
+            self._tell(batch)
+            done += len(batch.overlap)
+            self.report("registering pairs", done, total)
+
+    def _tell(self, found: RelativeMotions) -> None:
+        if self.on_pairs is not None:
+            self.on_pairs(found.in_input_frames(self.scans))
+
+    def _follow(self) -> None:
+        """Neighbours of a sequence, by descents from the motions before.
+
+        What is sure is known from here on; the rest competes with the search.
+        """
+        scans, step = self.scans, np.eye(self.scans.mean.shape[1] + 1)
+        sure: dict[tuple[int, int], np.ndarray] = {}
+        found = [] if self.known is None else [self.known]
+        gaps = [(k, k + gap) for gap in (1, 2) for k in range(scans.num_scans - gap)]
+        for done, (i, j) in enumerate(gaps):
+            self.report("following the sequence", done, len(gaps))
+            guess = step if j == i + 1 else None
+            if guess is None and (i, i + 1) in sure and (i + 1, j) in sure:
+                guess = sure[i, i + 1] @ sure[i + 1, j]
+            if guess is None:
+                continue
+            one = descended_in_input_frames(self.method, scans, (i, j), guess)
+            if float(one.overlap[0, 0]) < SURE:
+                self.rivals[i, j] = one
+                continue
+            # Known pairs are followed, too: a run taken up again goes the same way.
+            if (i, j) not in self.row:
+                self._tell(one)
+                self.row[i, j] = sum(len(x.overlap) for x in found)
+                found.append(one.with_modes(num_kept(self.method)))
+            step = sure[i, j] = np.asarray(one.in_input_frames(scans).T_i_j[0, 0])
+        self.report("following the sequence", len(gaps), len(gaps))
+        if found:
+            self.known = jax.tree.map(lambda *x: jnp.concatenate(x), *found)
+
+    def _evidence(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Trusted pairs, likely overlap and parts, see `next_pairs`."""
+        motions = RelativeMotions.joined(self.found).padded(self.most)
+        placement, likely = _prospects(self.method, self.averaging, self.scans, motions)
+        trusted = np.zeros_like(self.tried)
+        i, j = np.asarray(motions.pairs).T
+        trusted[i, j] = np.asarray(believed(placement.edge_weight)) & (i != j)
+        likely = np.asarray(likely)
+        return trusted | trusted.T, likely + likely.T, np.asarray(placement.part)
+
+
+@compiled
+def _prospects(
+    method: ParticleFilter,
+    averaging: AbstractAverager | None,
+    scans: PreparedScans,
+    motions: RelativeMotions,
+) -> tuple[Placement, Float[Array, "v v"]]:
+    """Present poses, and the share of scan j that is near scan i by them, i < j."""
+    min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
+    found = place(motions, scans.num_scans, averaging, min_overlap)
+    T, spacing = found.T_world_i, _DRIFT * scans.coarsest
+
+    def share(pair: Array) -> Array:
+        i, j = pair
+        T_i_j = lie.inverse(T[i]) @ T[j]
+        problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
+        return lax.cond(
+            found.together(i, j),
+            lambda: score(problem, T_i_j, spacing).fitness,
+            lambda: jnp.zeros_like(spacing),
+        )
+
+    i, j = jnp.triu_indices(scans.num_scans, 1)
+    shares = lax.map(share, jnp.stack([i, j], axis=1))
+    return found, jnp.zeros((scans.num_scans,) * 2, T.dtype).at[i, j].set(shares)

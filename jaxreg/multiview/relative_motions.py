@@ -1,0 +1,144 @@
+"""Relative motions between pairs of scans: batches of the pairwise search."""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxreg._core.brief import BriefModule
+from jaxreg._core.compile import compiled
+from jaxreg._core.typing import Key
+from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.particle import ParticleFilter
+
+
+# Modes of a pair that are kept; most pairs have no second one.
+_MOST_MODES = 4
+
+
+def num_kept(method: ParticleFilter) -> int:
+    """Modes of a pair that `relative_motions` keeps, m."""
+    return min(_MOST_MODES, method.num_modes)
+
+
+class RelativeMotions(BriefModule):
+    """What the search found for pairs of scans, scan j on scan i.
+
+    Of each pair up to m modes of the posterior, the best first.
+
+    Attributes:
+        pairs: `(e, 2)` int32, the scans i < j.
+        T_i_j: `(e, m, d+1, d+1)`.
+        overlap: `(e, m)` see `RegistrationSolution`; 0 where there is no such mode.
+        inlier_rmse: `(e, m)` in the unit of the motions.
+    """
+
+    pairs: Int[Array, "*e 2"]
+    T_i_j: Float[Array, "*e m D D"]
+    overlap: Float[Array, "*e m"]
+    inlier_rmse: Float[Array, "*e m"]
+
+    @property
+    def num_modes(self) -> int:
+        """M."""
+        return self.overlap.shape[-1]
+
+    def of_modes(self, mode: Int[Array, " e"]) -> "RelativeMotions":
+        """One mode of each pair, m = 1."""
+        e = jnp.arange(len(mode))
+        parts = self.T_i_j, self.overlap, self.inlier_rmse
+        return RelativeMotions(self.pairs, *(x[e, mode][:, None] for x in parts))
+
+    @compiled
+    def rows(self, rows: Int[Array, " r"]) -> "RelativeMotions":
+        """Some of them."""
+        return jax.tree.map(lambda x: x[rows], self)
+
+    def or_better(self, others: list["RelativeMotions | None"]) -> "RelativeMotions":
+        """Where there is another motion of a pair that overlaps more, that one."""
+        out = self
+        for k, other in enumerate(others):
+            if other is None or float(other.overlap[0, 0]) <= float(self.overlap[k, 0]):
+                continue
+            other = other.with_modes(self.num_modes)
+            out = jax.tree.map(lambda x, y, k=k: x.at[k].set(y[0]), out, other)
+        return out
+
+    def with_modes(self, num: int) -> "RelativeMotions":
+        """With the best so many modes, some of which may not overlap."""
+        more = max(num - self.num_modes, 0)
+
+        def of(x: Array) -> Array:
+            return jnp.pad(x, [(0, 0), (0, more)] + [(0, 0)] * (x.ndim - 2))[:, :num]
+
+        parts = self.T_i_j, self.overlap, self.inlier_rmse
+        return RelativeMotions(self.pairs, *map(of, parts))
+
+    def padded(self, num: int) -> "RelativeMotions":
+        """With pairs of scan 0 and itself that do not overlap, to so many."""
+        more = num - len(self.overlap)
+
+        def pad(x: Array) -> Array:
+            return jnp.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1))
+
+        return jax.tree.map(pad, self)
+
+    @staticmethod
+    def joined(some: list["RelativeMotions"]) -> "RelativeMotions":
+        """All of them, in ascending order of the scans."""
+        every = jax.tree.map(lambda *x: jnp.concatenate(x), *some)
+        return every.rows(jnp.lexsort((every.pairs[:, 1], every.pairs[:, 0])))
+
+    def in_input_frames(self, scans: PreparedScans) -> "RelativeMotions":
+        """From the scans' centred frames and unit."""
+        T_i_j = scans.to_input_frames(self.T_i_j, *self._scans())
+        rmse = scans.radius * self.inlier_rmse
+        return RelativeMotions(self.pairs, T_i_j, self.overlap, rmse)
+
+    def in_centred_frames(self, scans: PreparedScans) -> "RelativeMotions":
+        """The other way."""
+        T_i_j = scans.to_centred_frames(self.T_i_j, *self._scans())
+        rmse = self.inlier_rmse / scans.radius
+        return RelativeMotions(self.pairs, T_i_j, self.overlap, rmse)
+
+    def _scans(self) -> tuple[Int[Array, "e m"], Int[Array, "e m"]]:
+        """Scans i and j of every mode."""
+        shape = self.overlap.shape
+        i, j = (jnp.broadcast_to(x[:, None], shape) for x in self.pairs.T)
+        return i, j
+
+
+@compiled
+def relative_motions(
+    method: ParticleFilter,
+    scans: PreparedScans,
+    pairs: Int[Array, "e 2"],
+    key: Key,
+) -> RelativeMotions:
+    """Registers scan j to scan i for each pair (i, j), one pair after another.
+
+    In the scans' centred frames. The random numbers of a pair depend on its ids alone,
+    not on the number of scans nor on its place in the batch, so any division of the
+    pairs into batches gives the same answer.
+    """
+
+    def one(pair: Array) -> RelativeMotions:
+        i, j = pair
+        solution = method.solve_indexed(
+            scans.cloud(j),
+            scans.cloud(i),
+            scans.table(j),
+            scans.table(i),
+            None,
+            jax.random.fold_in(jax.random.fold_in(key, i), j),
+        )
+        usable = scans.usable[i] & scans.usable[j]
+        modes = jax.tree.map(lambda x: x[: num_kept(method)], solution.modes)
+        return RelativeMotions(
+            pair,
+            modes.T_target_source,
+            jnp.where(usable, modes.overlap, 0),
+            modes.inlier_rmse,
+        )
+
+    return lax.map(one, pairs)

@@ -1,0 +1,6 @@
+"""The contract of every method of `register`, and what it returns."""
+
+from jaxreg.registrar.base import AbstractRegistrar as AbstractRegistrar
+from jaxreg.registrar.base import Modes as Modes
+from jaxreg.registrar.base import RegistrationSolution as RegistrationSolution
+from jaxreg.registrar.trace import SearchTrace as SearchTrace

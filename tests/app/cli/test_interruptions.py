@@ -1,0 +1,112 @@
+"""Runs that end early lose nothing that is finished, and leave nothing half done."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxreg
+from jaxreg.app.cli.main import main
+from tests.cli.stand_ins import POSES, fake_reconstruct, left, save_scans
+
+
+def test_a_failure_while_writing_leaves_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    scans = save_scans(folder)
+    fake_reconstruct(monkeypatch, POSES, [True] * 3)
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("jaxreg.app.result.write_g2o", full)
+    before = left(folder)
+    assert main(["multiview", *scans]) == 2
+    assert left(folder) == before
+
+
+def test_interruption_is_said_in_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jaxreg, "reconstruct", stopped)
+    assert main(["multiview", *scans]) == 130
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_an_interruption_that_python_dropped_is_heard_again():
+    code = """
+import gc, sys, time
+from jaxreg.app.cli import main
+
+def drop(*_):
+    gc.callbacks.clear()
+    raise KeyboardInterrupt
+
+def run(_):
+    gc.callbacks.append(drop)
+    gc.collect()
+    time.sleep(30)
+
+main._run, sys.argv = run, ["jaxreg", "info"]
+main.command()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr == "jaxreg: interrupted; no results were written.\n"
+
+
+def test_a_reader_who_leaves_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as pipe:
+        command = [sys.executable, "-m", "jaxreg", "--help"]
+        done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)
+    found = jaxreg.RelativeMotions(
+        jnp.array([[0, 1]]),
+        jnp.eye(4)[None, None],
+        jnp.array([[0.7]]),
+        jnp.array([[0.01]]),
+    )
+
+    def stopped(*_: Any, on_pairs: Any, **__: Any) -> None:
+        on_pairs(found)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jaxreg, "reconstruct", stopped)
+    assert main(["multiview", *scans]) == 130
+    message = capsys.readouterr().err
+    assert "pairs.jsonl: 1;" in message
+    assert "--resume" in message
+    kept = folder / "jaxreg-out" / "pairs.jsonl"
+    assert kept.exists()
+    # Pairs of another run are not taken for those of this one, nor lost.
+    assert main(["multiview", *scans, "--resume", "--seed", "1"]) == 2
+    assert "another seed" in capsys.readouterr().err
+    assert kept.exists()
+    given = fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans, "--resume", "--order", "sequential"]) == 0
+    options = given[0][2]
+    assert options["order"] == "sequential"
+    for one, other in zip(
+        jax.tree.leaves(options["previous"]), jax.tree.leaves(found), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    assert not kept.exists()

@@ -1,0 +1,226 @@
+"""What `jaxreg multiview` writes and tells, with a stand-in for the solver."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxreg.app.cli.main import main
+from jaxreg.io import read_points, read_tum
+from tests.cli.stand_ins import (
+    CLOUD,
+    FILES,
+    POSES,
+    fake_reconstruct,
+    left,
+    save_scans,
+    seen_from,
+    shift,
+    turned,
+    write_truth,
+)
+
+
+def test_multiview_writes_all_files_and_tables(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)
+    given = fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans, "--seed", "7"]) == 0
+    assert sorted(os.listdir("jaxreg-out")) == FILES
+    for scan in given[0][0]:
+        assert scan.dtype == np.float32
+        np.testing.assert_allclose(np.median(scan, axis=0), 0, atol=1e-6)
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    np.testing.assert_allclose(found["T_world_i"], POSES, atol=2e-6)
+    i, j = 1, 2
+    pair = found["pairs"][2]
+    assert (pair["i"], pair["j"]) == ("s1", "s2")
+    expected = np.linalg.inv(POSES[i]) @ POSES[j]
+    np.testing.assert_allclose(pair["T_i_j"], expected, atol=2e-6)
+    assert found["command"] == "jaxreg multiview s0.npy s1.npy s2.npy --seed 7"
+    assert set(found["times_s"]) == {"read", "compile", "run", "write"}
+    merged = read_points("jaxreg-out/merged.ply").reshape(3, 40, 3)
+    np.testing.assert_allclose(merged[1:], merged[:2], atol=2e-5)
+    text = capsys.readouterr().out
+    assert "CONVERGED: 3 of 3 scans placed, 3 of 3 pairs trusted" in text
+
+
+def test_multiview_far_from_the_origin_keeps_its_digits(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    far = np.array([466123.25, 5427001.5, 100.0])
+    for k, T in enumerate(POSES[:2]):
+        np.savetxt(folder / f"s{k}.xyz", seen_from(T) + far, fmt="%.9f")
+    fake_reconstruct(monkeypatch, POSES, [True] * 2)
+    assert main(["multiview", "s0.xyz", "s1.xyz", "--quiet"]) == 0
+    merged = read_points("jaxreg-out/merged.ply").reshape(2, 40, 3)
+    np.testing.assert_allclose(merged[0], CLOUD + far, rtol=0, atol=1e-6)
+    # The turn of 0.4 rad is known to float32, at a lever of some metres.
+    np.testing.assert_allclose(merged[1], merged[0], rtol=0, atol=1e-5)
+    _, poses = read_tum("jaxreg-out/poses.tum")
+    assert poses.shape == (2, 4, 4)
+
+
+def test_a_viewpoint_is_moved_with_each_scan(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)
+    given = fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans, "--viewpoint", "0", "-9", "1"]) == 0
+    eyes = given[0][2]["viewpoints"]
+    for eye, points, file in zip(eyes, given[0][0], scans, strict=True):
+        moved = np.load(folder / file)[0] - points[0]
+        np.testing.assert_allclose(eye + moved, [0, -9, 1], atol=1e-5)
+    assert main(["multiview", *scans, "--viewpoint", "0", "1"]) == 2
+    assert "--viewpoint: wanted 3 finite numbers" in capsys.readouterr().err
+
+
+def test_truth_adds_errors(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)
+    wrong = POSES.copy()
+    wrong[2] = wrong[2] @ turned(0.01, 0.0) @ shift(np.array([0.0, -1.0, -2.0]))
+    fake_reconstruct(monkeypatch, wrong, [True] * 3)
+    write_truth(folder, scans, POSES)
+    assert main(["multiview", *scans, "--truth", "truth.conf"]) == 0
+    errors = json.loads(Path("jaxreg-out/result.json").read_text())["errors"]
+    assert errors["names"] == ["s0", "s1", "s2"]
+    np.testing.assert_allclose(errors["e_R"], [0, 0, 0.01], atol=1e-5)
+    assert errors["mean_e_R"] == pytest.approx(0.01 / 3, abs=1e-5)
+    assert "e_R [rad]" in capsys.readouterr().out
+
+
+def test_a_lost_scan_is_reported_and_the_others_are_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)
+    fake_reconstruct(monkeypatch, POSES, [True, True, False])
+    assert main(["multiview", *scans, "--out", "deep/er"]) == 0
+    text = capsys.readouterr().out
+    assert "LOW_OVERLAP, not placed" in text
+    assert "2 of 3 scans placed" in text
+    found = json.loads(Path("deep/er/result.json").read_text())
+    assert found["T_world_i"][2] is None
+    assert found["scans"][2]["best_pair"]["overlap"] == pytest.approx(0.1)
+    assert len(read_points("deep/er/merged.ply")) == 80
+
+
+def test_a_second_object_is_a_model_of_its_own(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder) + ["t0.npy", "t1.npy"]
+    shutil.copy("s0.npy", "t0.npy")
+    shutil.copy("s1.npy", "t1.npy")
+    poses = POSES[[0, 1, 2, 0, 1]]
+    fake_reconstruct(monkeypatch, poses, [True] * 3 + [False] * 2, [0, 0, 0, 1, 1])
+    assert main(["multiview", *scans]) == 0
+    text = capsys.readouterr().out
+    assert "component 1" in text
+    assert "Component 1: 2 scans that fit each other" in text
+    assert "merged_1.ply" in text
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    assert [scan["component"] for scan in found["scans"]] == [0, 0, 0, 1, 1]
+    own = read_points("jaxreg-out/merged_1.ply")
+    # In the frame of t0.npy, the first scan of its component.
+    np.testing.assert_allclose(own[:40], seen_from(POSES[0]), atol=1e-5)
+    np.testing.assert_allclose(own[40:], own[:40], atol=1e-5)
+    # A later run with one component leaves nothing of the other behind.
+    (folder / "jaxreg-out" / "merged_2.ply").write_text("mine")
+    fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans[:3]]) == 0
+    assert sorted(os.listdir("jaxreg-out")) == sorted([*FILES, "merged_2.ply"])
+
+
+def test_errors_of_a_second_object_are_told(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = [*save_scans(folder), "t0.npy", "t1.npy"]
+    shutil.copy("s0.npy", "t0.npy")
+    shutil.copy("s1.npy", "t1.npy")
+    found = POSES[[0, 1, 2, 0, 1]]
+    found[4] = found[4] @ turned(0.01, 0.0)
+    fake_reconstruct(monkeypatch, found, [True] * 3 + [False] * 2, [0, 0, 0, 1, 1])
+    write_truth(folder, scans, POSES[[0, 1, 2, 0, 1]])
+    assert main(["multiview", *scans, "--truth", "truth.conf"]) == 0
+    errors = json.loads(Path("jaxreg-out/result.json").read_text())["errors"]
+    assert errors["component"] == [0, 0, 0, 1, 1]
+    np.testing.assert_allclose(errors["e_R"], [0, 0, 0, 0, 0.01], atol=1e-5)
+    assert "t1, component 1" in capsys.readouterr().out
+
+
+def test_scans_without_overlap_are_named_and_nothing_is_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)[:2]
+    fake_reconstruct(monkeypatch, POSES, [True, False])
+    before = left(folder)
+    assert main(["multiview", *scans]) == 2
+    message = capsys.readouterr().err
+    assert "s0.npy and s1.npy: no two scans could be joined" in message
+    assert len(message.splitlines()) == 2
+    assert left(folder) == before
+
+
+def test_dropped_rows_are_counted(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)
+    holed = seen_from(POSES[1])
+    holed = np.concatenate([holed, [[np.nan, 0, 0], [np.inf, 0, 0]]])
+    np.save(folder / "s1.npy", holed)
+    fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans]) == 0
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    assert [s["num_dropped"] for s in found["scans"]] == [0, 2, 0]
+    assert [s["num_points"] for s in found["scans"]] == [40, 42, 40]
+    assert len(read_points("jaxreg-out/merged.ply")) == 120
+
+
+def test_large_scans_are_thinned_and_it_is_said(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)
+    np.save(folder / "s1.npy", np.repeat(seen_from(POSES[1]), 3, axis=0))
+    monkeypatch.setattr("jaxreg.app.cli.inputs._MAX_POINTS", 50)
+    given = fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans]) == 0
+    said = capsys.readouterr().out
+    assert "s1.npy: large, one of 3 points is used, 40 in all." in said
+    assert [len(scan) for scan in given[0][0]] == [40, 40, 40]
+
+
+def test_budget_and_precision_reach_the_search(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    scans = save_scans(folder)
+    given = fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    options = ["--budget", "100", "--precision", "float64", "--device", "cpu"]
+    assert main(["multiview", *scans, *options]) == 0
+    found, _, settings = given[0]
+    assert all(scan.dtype == np.float64 for scan in found)
+    method = settings["method"]
+    assert (method.num_prior, method.num_particles) == (100, 100)
+    assert jnp.zeros(()).dtype == jnp.float32  # the setting ends with the command
+    told = json.loads(Path("jaxreg-out/result.json").read_text())
+    np.testing.assert_allclose(told["T_world_i"], POSES, atol=1e-12)
+
+
+def test_names_that_are_no_utf_8(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = [os.fsdecode(b"scan\xff%d.npy" % k) for k in range(3)]
+    for old, new in zip(save_scans(folder), scans, strict=True):
+        os.rename(old, new)
+    fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", *scans]) == 0
+    assert sorted(os.listdir("jaxreg-out")) == FILES
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    assert found["names"] == [rf"scan\xff{k}" for k in range(3)]
+    assert main(["info", *scans]) == 0
+    assert r"scan\udcff0.npy: 3D scan" in capsys.readouterr().out
