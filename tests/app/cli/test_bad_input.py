@@ -7,7 +7,7 @@ import pytest
 
 from jaxreg.app.cli.main import main
 from jaxreg.io import write_ply
-from tests.cli.stand_ins import CLOUD, left, save_scans
+from tests.app.cli.stand_ins import CLOUD, left, save_scans
 
 
 def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:

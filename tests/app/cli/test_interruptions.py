@@ -13,7 +13,7 @@ import pytest
 
 import jaxreg
 from jaxreg.app.cli.main import main
-from tests.cli.stand_ins import POSES, fake_reconstruct, left, save_scans
+from tests.app.cli.stand_ins import POSES, fake_reconstruct, left, save_scans
 
 
 def test_a_failure_while_writing_leaves_nothing(

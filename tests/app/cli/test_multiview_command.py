@@ -11,7 +11,7 @@ import pytest
 
 from jaxreg.app.cli.main import main
 from jaxreg.io import read_points, read_tum
-from tests.cli.stand_ins import (
+from tests.app.cli.stand_ins import (
     CLOUD,
     FILES,
     POSES,

@@ -11,7 +11,7 @@ import pytest
 import jaxreg
 from jaxreg import Status
 from jaxreg.app.cli.main import main
-from tests.cli.stand_ins import (
+from tests.app.cli.stand_ins import (
     FILES,
     GRAPH,
     POSES,

@@ -13,7 +13,7 @@ import pytest
 import jaxreg
 from jaxreg.app.cli.main import main
 from jaxreg.io import MissingExtraError
-from tests.cli.stand_ins import (
+from tests.app.cli.stand_ins import (
     FILES,
     GRAPH,
     POSES,
