@@ -58,14 +58,20 @@ from jaxreg._core.adjoint import (
     RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
 )
 from jaxreg._core.status import Status as Status
+from jaxreg.averaging import MCC as MCC
 from jaxreg.averaging import AveragingSolution as AveragingSolution
 from jaxreg.averaging import AveragingTrace as AveragingTrace
+from jaxreg.averaging import ChordalError as ChordalError
 from jaxreg.averaging import Correntropy as Correntropy
+from jaxreg.averaging import LogError as LogError
 from jaxreg.averaging import LowRankSparse as LowRankSparse
 from jaxreg.averaging import MotionAveraging as MotionAveraging
 from jaxreg.averaging import PoseGraphLM as PoseGraphLM
+from jaxreg.averaging import RootRows as RootRows
+from jaxreg.averaging import ShortestPaths as ShortestPaths
 from jaxreg.averaging import SpanningTree as SpanningTree
 from jaxreg.averaging import WeightedMotionAveraging as WeightedMotionAveraging
+from jaxreg.averaging import WeightRows as WeightRows
 from jaxreg.averaging import average as average
 from jaxreg.averaging import pose_covariances as pose_covariances
 from jaxreg.correlation import KernelCorrelation as KernelCorrelation

@@ -11,7 +11,7 @@ wrong far from it. Which to take:
 
     no outliers                              L2
     far from the solution                    L1, Huber
-    near it, clutter or partial overlap      GemanMcClure, Cauchy, Correntropy, Tukey
+    near it, clutter or partial overlap      GemanMcClure, Cauchy, Welsch, Tukey
     the share of the overlap is known        Trimmed
 
     >>> from jaxreg import robust
@@ -182,8 +182,8 @@ class Tukey(AbstractKernel):
         return (1 - jnp.minimum(sq_residual / _square(width), 1)) ** 2
 
 
-class Correntropy(AbstractKernel):
-    """rho = width^2 (1 - exp(-r^2 / (2 width^2))): Welsch; MCC paper, Eq. 3, 4.
+class Welsch(AbstractKernel):
+    """rho = width^2 (1 - exp(-r^2 / (2 width^2))): correntropy; MCC paper, Eq. 3, 4.
 
     Redescending and bounded by width^2. Its weights are Gaussian in the residual: the
     choice where the noise of the good residuals is Gaussian of that width.

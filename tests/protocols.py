@@ -63,6 +63,7 @@ REGISTRARS = {
 #: Methods of `average`.
 AVERAGERS = {
     "SpanningTree": Row(lambda d: jr.SpanningTree(), "zero"),
+    "ShortestPaths": Row(lambda d: jr.ShortestPaths(), "zero"),
     "CycleConsensus": Row(lambda d: CycleConsensus(), "zero"),
     "LowRankSparse": Row(lambda d: jr.LowRankSparse(), "zero"),
     "MotionAveraging": Row(lambda d: jr.MotionAveraging(tolerance=1e-13), "exact"),
@@ -70,10 +71,8 @@ AVERAGERS = {
         lambda d: jr.WeightedMotionAveraging(tolerance=1e-13), "exact"
     ),
     "Correntropy": Row(lambda d: jr.Correntropy(tolerance=1e-13), "at held widths"),
-    "Correntropy, paper": Row(
-        lambda d: jr.Correntropy(
-            "paper", tolerance=1e-13, max_steps=400, initialiser=jr.SpanningTree()
-        ),
+    "MCC": Row(
+        lambda d: jr.MCC(tolerance=1e-13, max_steps=400, initialiser=jr.SpanningTree()),
         "exact",
     ),
     "PoseGraphLM": Row(lambda d: jr.PoseGraphLM(tolerance=1e-15), "exact"),

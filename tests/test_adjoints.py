@@ -221,9 +221,7 @@ def test_memory_of_a_gradient_does_not_grow_with_the_steps():
         return lambda x: _answer(_solve(method, x, target, guess))
 
     def averaged(steps):
-        method = jr.Correntropy(
-            "paper", tolerance=0.0, max_steps=steps, initialiser=jr.SpanningTree()
-        )
+        method = jr.MCC(tolerance=0.0, max_steps=steps, initialiser=jr.SpanningTree())
         return lambda x: jnp.sum(jr.average(graph(x, weight), method).T_world_i[1])
 
     for value, x in ((registered, source), (averaged, T)):

@@ -10,11 +10,11 @@ from jaxreg.robust import (
     L1,
     L2,
     Cauchy,
-    Correntropy,
     GemanMcClure,
     Huber,
     Trimmed,
     Tukey,
+    Welsch,
 )
 
 
@@ -26,13 +26,13 @@ DEFINITION = {  # rho(r), written independently of the implementation
     Cauchy: lambda r, c: c**2 / 2 * np.log(1 + (r / c) ** 2),
     GemanMcClure: lambda r, c: r**2 / 2 / (1 + (r / c) ** 2),
     Tukey: lambda r, c: c**2 / 6 * np.where(r <= c, 1 - (1 - (r / c) ** 2) ** 3, 1.0),
-    Correntropy: lambda r, c: c**2 * (1 - np.exp(-(r**2) / (2 * c**2))),
+    Welsch: lambda r, c: c**2 * (1 - np.exp(-(r**2) / (2 * c**2))),
     Trimmed: lambda r, c: np.minimum(r, c) ** 2 / 2,
 }
 LIMIT = {  # rho at infinity over the squared width
     GemanMcClure: 1 / 2,
     Tukey: 1 / 6,
-    Correntropy: 1,
+    Welsch: 1,
     Trimmed: 1 / 2,
 }
 KERNELS = [kernel() for kernel in DEFINITION]

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.io
 from scipy.spatial.transform import Rotation
 
-from jaxreg.averaging import SpanningTree, average
+from jaxreg.averaging import ShortestPaths, average
 from jaxreg.graph import PoseGraph
 from jaxreg.io import read_log
 
@@ -128,7 +128,7 @@ def chained(logs: list[Path]) -> tuple[np.ndarray, np.ndarray]:
     edges = np.concatenate([part.edges for part in parts])
     T_i_j = np.concatenate([part.T_i_j for part in parts])
     graph = PoseGraph.from_edges(edges, T_i_j, parts[0].num_poses)
-    found = average(graph, SpanningTree(by="path"))
+    found = average(graph, ShortestPaths())
     component = np.asarray(found.component)
     known = component == np.bincount(component).argmax()
     return np.asarray(found.T_world_i, float), known

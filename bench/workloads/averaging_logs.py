@@ -20,6 +20,7 @@ from bench.workloads.averaging_data import (
 )
 from bench.workloads.local_pairs import written_out
 from jaxreg.averaging import (
+    MCC,
     AbstractAverager,
     Correntropy,
     LowRankSparse,
@@ -34,7 +35,7 @@ METHODS: dict[str, AbstractAverager] = {
     "tree": SpanningTree(),
     "LRS": LowRankSparse(),
     "MA": MotionAveraging(),
-    "MCC paper": Correntropy(width="paper", initialiser=SpanningTree()),
+    "MCC paper": MCC(initialiser=SpanningTree()),
     "default": Correntropy(),
 }
 #: Graph, true poses, frames that have one.

@@ -15,6 +15,7 @@ from bench.records import error, share
 from bench.workloads.averaging_data import on_group
 from bench.workloads.local_pairs import written_out
 from jaxreg.averaging import (
+    MCC,
     AbstractAverager,
     Correntropy,
     MotionAveraging,
@@ -31,7 +32,7 @@ from tests.averaging.graphs import random_graph
 SIZES, SHARES, SEEDS = ((12, 46), (16, 100), (32, 465)), (0.0, 0.3, 0.5, 0.6), 20
 METHODS: dict[str, AbstractAverager] = {
     "MA": MotionAveraging(),
-    "MCC paper": Correntropy(width="paper", initialiser=SpanningTree()),
+    "MCC paper": MCC(initialiser=SpanningTree()),
     "default": Correntropy(),
 }
 

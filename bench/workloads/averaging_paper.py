@@ -13,6 +13,7 @@ from bench.motion_scans import SETS, Motions, estimate
 from bench.records import Metric, error
 from bench.workloads.local_pairs import written_out
 from jaxreg.averaging import (
+    MCC,
     AbstractAverager,
     Correntropy,
     LowRankSparse,
@@ -49,12 +50,10 @@ ROWS = {
     "G2O, from LRS": Row(PoseGraphLM(), from_lrs=True),
     "MA, from LRS": Row(MotionAveraging(), from_lrs=True),
     "wMA, from LRS": Row(WeightedMotionAveraging(), from_lrs=True, weighted=True),
-    "MCC, from LRS": Row(Correntropy(width="paper"), from_lrs=True),
+    "MCC, from LRS": Row(MCC(), from_lrs=True),
     "default, from LRS": Row(Correntropy(), from_lrs=True),
-    "MCC, from cycles": Row(Correntropy(width="paper")),
-    "MCC, from a tree, overlap": Row(
-        Correntropy(width="paper", initialiser=SpanningTree()), weighted=True
-    ),
+    "MCC, from cycles": Row(MCC()),
+    "MCC, from a tree, overlap": Row(MCC(initialiser=SpanningTree()), weighted=True),
     "default": Row(Correntropy()),
     "default, overlap": Row(Correntropy(), weighted=True),
 }

@@ -19,7 +19,9 @@ from bench.timing import within
 from bench.workloads.local_pairs import written_out
 from jaxreg.app.plot.figure import principal_axes, tilt
 from jaxreg.averaging import (
+    MCC,
     AbstractAverager,
+    ChordalError,
     Correntropy,
     MotionAveraging,
     PoseGraphLM,
@@ -43,7 +45,7 @@ DRAWN, POSES, CLOSURES = 0.3, 300, 60
 OWN: dict[str, tuple[AbstractAverager, bool]] = {
     "jaxreg MotionAveraging": (MotionAveraging(), False),
     "jaxreg PoseGraphLM": (PoseGraphLM(), False),
-    "jaxreg MCC paper, from odometry": (Correntropy(width="paper"), True),
+    "jaxreg MCC paper, from odometry": (MCC(), True),
     "jaxreg default, from odometry": (Correntropy(), True),
     "jaxreg default": (Correntropy(), False),
 }
@@ -72,7 +74,7 @@ def cases(options: Options) -> Iterator[Case]:
         if not path.exists():
             continue
         clean = read_g2o(path)
-        T_clean = average(clean, PoseGraphLM(objective="chordal")).T_world_i
+        T_clean = average(clean, PoseGraphLM(ChordalError())).T_world_i
         for share in SHARES:
             trials = [with_false_closures(clean, share, seed) for seed in range(SEEDS)]
             num = int(trials[0].false.sum())
@@ -140,7 +142,7 @@ def methods(graph: str, clean: PoseGraph) -> list[Method]:
         )
         for name, (k, text) in PEERS.items()
     ]
-    optimum = PoseGraphLM(objective="chordal")
+    optimum = PoseGraphLM(ChordalError())
     return [
         Method("odometry", "jaxreg", "successive edges chained", _odometry),
         *own,
@@ -162,7 +164,7 @@ def _own(method: AbstractAverager, from_odometry: bool, trial: Trial) -> Found:
     init = jnp.asarray(trial.T_odometry) if from_odometry else None
     found = average(trial.graph, method, init)
     # The others trust all edges alike.
-    tells = isinstance(method, Correntropy)
+    tells = isinstance(method, MCC | Correntropy)
     weight = np.asarray(found.edge_weight) if tells else None
     return Found(np.asarray(found.T_world_i), weight)
 

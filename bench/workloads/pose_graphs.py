@@ -13,6 +13,7 @@ from bench.records import Metric
 from bench.workloads.local_pairs import written_out
 from jaxreg.averaging import (
     AbstractAverager,
+    ChordalError,
     Correntropy,
     MotionAveraging,
     PoseGraphLM,
@@ -35,7 +36,7 @@ OPTIMA = {
 }
 METHODS: dict[str, AbstractAverager] = {
     "jaxreg PoseGraphLM": PoseGraphLM(),
-    "jaxreg PoseGraphLM, chordal": PoseGraphLM(objective="chordal"),
+    "jaxreg PoseGraphLM, chordal": PoseGraphLM(ChordalError()),
     "jaxreg MotionAveraging": MotionAveraging(),
     "jaxreg default": Correntropy(),
 }

@@ -54,7 +54,7 @@ def draw(solution: Solution, *data: Any, names: Sequence[str] | None = None) -> 
     _require_one(solution)
     if isinstance(solution, jaxreg.AveragingSolution):
         graph = _graph(data)
-        before = jaxreg.average(graph, jaxreg.SpanningTree(by="path"))
+        before = jaxreg.average(graph, jaxreg.ShortestPaths())
         return draw_graph(
             np.asarray(graph.edges)[np.asarray(graph.mask)],
             np.asarray(before.T_world_i, np.float64),

@@ -6,11 +6,17 @@ from jaxreg.averaging.base import AveragingSolution as AveragingSolution
 from jaxreg.averaging.covariance import pose_covariances as pose_covariances
 from jaxreg.averaging.methods.correntropy import Correntropy as Correntropy
 from jaxreg.averaging.methods.low_rank_sparse import LowRankSparse as LowRankSparse
+from jaxreg.averaging.methods.mcc import MCC as MCC
 from jaxreg.averaging.methods.motion_averaging import MotionAveraging as MotionAveraging
 from jaxreg.averaging.methods.motion_averaging import (
     WeightedMotionAveraging as WeightedMotionAveraging,
 )
 from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM as PoseGraphLM
+from jaxreg.averaging.methods.shortest_paths import ShortestPaths as ShortestPaths
 from jaxreg.averaging.methods.spanning_tree import SpanningTree as SpanningTree
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus as CycleConsensus
+from jaxreg.averaging.steps.edge_errors import ChordalError as ChordalError
+from jaxreg.averaging.steps.edge_errors import LogError as LogError
+from jaxreg.averaging.steps.rows import RootRows as RootRows
+from jaxreg.averaging.steps.rows import WeightRows as WeightRows
 from jaxreg.averaging.trace import AveragingTrace as AveragingTrace

@@ -92,8 +92,8 @@ def length_scale(graph: PoseGraph) -> Float[Array, ""]:
     )
     valid = graph.weight > 0
     low, high = (
-        masked_quantile(length, valid, 0.25),
-        masked_quantile(length, valid, 0.75),
+        nearest_rank(length, valid, 0.25),
+        nearest_rank(length, valid, 0.75),
     )
     middle = valid & (length >= low) & (length <= high)
     count = jnp.maximum(jnp.sum(middle), 1).astype(length.dtype)
@@ -109,7 +109,7 @@ def num_held(graph: PoseGraph) -> Float[Array, ""]:
     return jnp.maximum(jnp.sum(held > 0, dtype=w.dtype), 1)
 
 
-def masked_quantile(
+def nearest_rank(
     x: Float[Array, " e"], mask: Bool[Array, " e"], q: float | Array
 ) -> Float[Array, ""]:
     """The value of `x[mask]` at quantile q (nearest rank); 0 if the mask is empty."""

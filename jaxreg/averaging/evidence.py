@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxreg.averaging.base import (
     length_scale,
-    masked_quantile,
+    nearest_rank,
     num_held,
     weighted_mean,
 )
@@ -38,7 +38,7 @@ def prior_odds(graph: PoseGraph) -> Float[Array, " e"]:
     A weight says how much likelier than usual an edge is right.
     """
     present = graph.weight > 0
-    usual = masked_quantile(graph.weight, present, 0.5)
+    usual = nearest_rank(graph.weight, present, 0.5)
     return jnp.log(jnp.where(present, graph.weight / jnp.where(usual > 0, usual, 1), 1))
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.averaging import AbstractAverager, Correntropy, SpanningTree
+from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import PlaneToPlane, Problem, mutual_overlap, score
@@ -43,7 +43,7 @@ def refine(
     Args:
         scans: prepared scans.
         placement: poses of the centred frames, and which scans hang together.
-        averaging: None for the MCC paper's `Correntropy`.
+        averaging: None for `MCC`.
         min_overlap: of the pairs that count.
 
     Returns:
@@ -61,7 +61,7 @@ def refine(
 def wide_unless_given(averaging: AbstractAverager | None) -> AbstractAverager:
     """No outliers are left: the paper's wider kernel takes more pairs in."""
     if averaging is None:
-        return Correntropy(width="paper", initialiser=SpanningTree())
+        return MCC(initialiser=SpanningTree())
     return averaging
 
 

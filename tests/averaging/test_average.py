@@ -6,11 +6,15 @@ from scipy.linalg import expm, logm
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import (
+    MCC,
     AveragingSolution,
     Correntropy,
     MotionAveraging,
+    RootRows,
+    ShortestPaths,
     SpanningTree,
     WeightedMotionAveraging,
+    WeightRows,
     average,
 )
 from jaxreg.averaging.steps.gauss_newton import (
@@ -30,10 +34,10 @@ pytestmark = pytest.mark.usefixtures("quickly_compiled")
 N, H = 12, 60
 METHODS = {
     "tree": SpanningTree(),
-    "paths": SpanningTree(by="path"),
+    "paths": ShortestPaths(),
     "plain": MotionAveraging(),
     "weighted": WeightedMotionAveraging(),
-    "correntropy": Correntropy(width="paper", initialiser=SpanningTree()),
+    "correntropy": MCC(initialiser=SpanningTree()),
     "annealed": Correntropy(),
 }
 
@@ -109,7 +113,7 @@ def rvec(v: np.ndarray) -> np.ndarray:
     return expm(m - np.pad(m[:3, :3].T, (0, 1)))
 
 
-@pytest.mark.parametrize("rows", ["sqrt", "weight"])
+@pytest.mark.parametrize("rows", [RootRows(), WeightRows()])
 @pytest.mark.parametrize("kind", ["weighted", "correntropy"])
 def test_one_step_against_the_stacked_system_of_the_paper(rows, kind):
     X, edges, T, _ = random_graph(N, H, 0.1, 2)
@@ -122,7 +126,7 @@ def test_one_step_against_the_stacked_system_of_the_paper(rows, kind):
         if kind == "weighted":
             method = WeightedMotionAveraging(rows=rows, max_steps=1)
         else:
-            method = Correntropy(width="paper", alpha=0.8, rows=rows, max_steps=1)
+            method = MCC(alpha=0.8, rows=rows, max_steps=1)
         solution = average(graph, method, init=init)
     w = prior.copy()
     if kind == "correntropy":
@@ -132,7 +136,7 @@ def test_one_step_against_the_stacked_system_of_the_paper(rows, kind):
         e = np.sqrt((gaps**2).sum((1, 2)))
         sigma = 0.8 * (prior * e).sum() / prior.sum()
         w = prior * np.exp(-(e**2) / (2 * sigma**2))
-    row = np.sqrt(w) if rows == "sqrt" else w
+    row = np.sqrt(w) if isinstance(rows, RootRows) else w
     D, dV = np.zeros((6 * H, 6 * N)), np.zeros(6 * H)
     for h, (i, j) in enumerate(edges):
         at = slice(6 * h, 6 * h + 6)

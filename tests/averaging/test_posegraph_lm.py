@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxreg._core.status import Status
-from jaxreg.averaging import PoseGraphLM, average
+from jaxreg.averaging import ChordalError, LogError, PoseGraphLM, average
 from jaxreg.graph import PoseGraph
 from jaxreg.io import read_g2o
 from jaxreg.metrics import chordal_objective
@@ -80,11 +80,12 @@ def chordal_errors(graph: tuple, T: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize("objective", ["log", "chordal"])
-def test_minimum_against_scipy(objective, d):
+@pytest.mark.parametrize("error", [LogError(), ChordalError()])
+def test_minimum_against_scipy(error, d):
     graph = problem(d)
     X, edges, T, weight, information, _ = graph
-    errors = log_errors if objective == "log" else chordal_errors
+    chordal = isinstance(error, ChordalError)
+    errors = chordal_errors if chordal else log_errors
     best = least_squares(
         lambda x: errors(graph, poses(x, d, X)).ravel(),
         np.zeros((N - 1) * information.shape[-1]),
@@ -93,11 +94,11 @@ def test_minimum_against_scipy(objective, d):
     )
     with jax.enable_x64(True):
         posed = PoseGraph.from_edges(edges, T, N, weight, information)
-        method = PoseGraphLM(objective=objective, tolerance=1e-12)
+        method = PoseGraphLM(error, tolerance=1e-12)
         solution = average(posed, method, init=X)
         assert solution.status == Status.CONVERGED
         np.testing.assert_allclose(solution.T_world_i, poses(best.x, d, X), atol=1e-5)
-        if objective == "chordal":
+        if chordal:
             value = chordal_objective(posed, solution.T_world_i)
             np.testing.assert_allclose(value, 2 * best.cost, rtol=1e-8)
 
@@ -145,7 +146,7 @@ def test_single_precision_from_the_motions_alone():
 def test_certified_optima_from_the_motions_alone(name, optimum):
     with jax.enable_x64(True):
         graph = read_g2o(data_dir("pose_graphs", f"{name}.g2o"))
-        solution = average(graph, PoseGraphLM(objective="chordal"))
+        solution = average(graph, PoseGraphLM(ChordalError()))
         assert solution.status == Status.CONVERGED
         value = chordal_objective(graph, solution.T_world_i)
     np.testing.assert_allclose(value, optimum, rtol=1e-5)

@@ -19,7 +19,7 @@ from jaxreg.averaging import (
     AveragingSolution,
     Correntropy,
     MotionAveraging,
-    SpanningTree,
+    ShortestPaths,
     WeightedMotionAveraging,
     average,
 )
@@ -73,7 +73,7 @@ class Average(Options):
         key = self.key()
         with session.progress() as progress, session.timed("run", computes=True):
             progress("averaging", 0, 2)
-            before = average(graph, method=SpanningTree(by="path"))
+            before = average(graph, method=ShortestPaths())
             progress("averaging", 1, 2)
             sol = average(graph, method=method, key=key)
             jax.block_until_ready(sol)

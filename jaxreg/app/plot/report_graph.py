@@ -55,7 +55,7 @@ def write_graph_report(
         MissingExtraError: if plotly is not installed.
     """
     if before is None:
-        before = jaxreg.average(graph, method=jaxreg.SpanningTree(by="path"))
+        before = jaxreg.average(graph, method=jaxreg.ShortestPaths())
     T = np.asarray(solution.T_world_i, np.float64)
     labels = [str(x) for x in (range(len(T)) if names is None else names)]
     placed = np.asarray(solution.placed, bool)

@@ -1,11 +1,11 @@
 """Motion averaging under the maximum correntropy criterion.
 
-Reference: Zhu, Hu, Lu, Chen, Li, Li, Robust Motion Averaging under Maximum Correntropy
-Criterion (the MCC paper): Algorithm 1, with the update of Eq. 21 on the left, where
-Eq. 14 needs it, and "until change is negligible and k >= K" read as "or".
+The criterion is that of Zhu, Hu, Lu, Chen, Li, Li, Robust Motion Averaging under
+Maximum Correntropy Criterion (the MCC paper); start, widths and steps go beyond it.
+`MCC` is the published algorithm.
 """
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,38 +18,26 @@ from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
     AveragingSolution,
-    frobenius,
     length_scale,
-    solution,
     start,
-    weighted_mean,
 )
 from jaxreg.averaging.evidence import coherence, redundancy
 from jaxreg.averaging.methods.graduated import graduated
-from jaxreg.averaging.methods.motion_averaging import (
-    RowsOf,
-    check_rows,
-    iterate_plain,
-    scaled_rows,
-)
+from jaxreg.averaging.methods.motion_averaging import iterate_plain
 from jaxreg.averaging.start.closures import without_lone_closures
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus
 from jaxreg.averaging.steps.gauss_newton import (
     gauss_newton_gradients,
     gauss_newton_step,
 )
-from jaxreg.averaging.steps.iterate import (
-    Iterated,
-    averaging_gradients,
-    averaging_step,
-    iterate,
-)
+from jaxreg.averaging.steps.iterate import Iterated, iterate, solution_of
 from jaxreg.averaging.steps.kernel_width import (
     annealed_width,
     first_width,
     followed_width,
     gaussian_trust,
 )
+from jaxreg.averaging.steps.rows import RootRows
 from jaxreg.averaging.trace import AveragingTrace, no_rows
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import along_frames
@@ -71,17 +59,10 @@ class Correntropy(AbstractAverager):
     frames the steps are those of Gauss-Newton, in which each part counts at its
     precision, or by `information` where the graph has it; a wide kernel may draw a
     start to a larger, less coherent group, so a narrow one is tried, too.
-    `width="paper"` is the published Algorithm 1. Larger graphs take `graduated` steps;
-    where those leave many edges out, the chain of successive frames is tried as a
-    start, and that no motion is wrong.
+    Larger graphs take `graduated` steps; where those leave many edges out, the chain of
+    successive frames is tried as a start, and that no motion is wrong.
 
     Attributes:
-        width: "annealed", or "paper" for sigma_k = alpha e_k with the mean residual
-            e_k of Eq. 22 (static).
-        alpha: kernel width over the mean residual, for "paper".
-        rows: "sqrt" scales rows by the root of the weight, as half-quadratic theory
-            asks; "weight" by the weight itself, as printed in Eq. 17 (static). For
-            "paper", and for the few plain steps that a start takes.
         max_steps: largest number of steps (static).
         tolerance: stop below this change, radians and share of the size of the scene.
         initialiser: finds the start when `init` is None.
@@ -90,25 +71,14 @@ class Correntropy(AbstractAverager):
     change the answer.
 
     Gradients: implicit at the fixed point with respect to `T_i_j`, `weight` and
-    `information`; length scale and start are cut. The widths of "paper" are followed,
-    with respect to `alpha`, too. Those of "annealed" are if they have settled; widths
-    that would grow, but may not, and those of graphs above `DENSE_LIMIT` frames, are
-    held, and then the derivative is that at held widths.
+    `information`; length scale and start are cut. Widths are followed if they have
+    settled; widths that would grow, but may not, and those of graphs above
+    `DENSE_LIMIT` frames, are held, and then the derivative is that at held widths.
     """
 
-    width: Literal["annealed", "paper"] = eqx.field(static=True, default="annealed")
-    alpha: Array | float = traced(1.0)
-    rows: Literal["sqrt", "weight"] = eqx.field(static=True, default="sqrt")
     max_steps: int = eqx.field(static=True, default=100)
     tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = CycleConsensus()
-
-    def __check_init__(self) -> None:
-        check_rows(self.rows)
-        if self.width not in ("annealed", "paper"):
-            raise ValueError(
-                f"width: wanted 'annealed' or 'paper', found {self.width!r}."
-            )
 
     def solve(
         self,
@@ -117,7 +87,7 @@ class Correntropy(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Averages a prepared graph."""
-        if self.width == "annealed" and graph.num_poses > DENSE_LIMIT:
+        if graph.num_poses > DENSE_LIMIT:
             return self._large(graph, init, key)
         T_start = start(self.initialiser, graph, init, key)
         return self._small(graph, T_start, init is None)
@@ -126,31 +96,13 @@ class Correntropy(AbstractAverager):
     def _large(
         self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
     ) -> AveragingSolution:
-        return _solution(graph, self._graduated(graph, init, key))
+        return solution_of(graph, self._graduated(graph, init, key))
 
     @compiled
     def _small(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"], compare: bool
     ) -> AveragingSolution:
-        end = self._annealed if self.width == "annealed" else self._paper
-        return _solution(graph, end(graph, T_start, compare))
-
-    def _paper(
-        self, graph: PoseGraph, T_start: Float[Array, "v D D"], _: bool
-    ) -> Iterated:
-        scale, rows = length_scale(graph), scaled_rows(self.rows)
-        end = iterate(
-            graph,
-            T_start,
-            jnp.full((2,), jnp.inf, scale.dtype),
-            eqx.Partial(_paper_width, jax.lax.stop_gradient(self.alpha), scale),
-            gaussian_trust,
-            averaging_step(rows),
-            max_steps=self.max_steps,
-            tolerance=self.tolerance,
-        )
-        followed = eqx.Partial(_paper_trust, self.alpha, scale)
-        return averaging_gradients(graph, end, followed, rows)
+        return solution_of(graph, self._annealed(graph, T_start, compare))
 
     def _annealed(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"], compare: bool
@@ -159,7 +111,7 @@ class Correntropy(AbstractAverager):
         fixed, T_start = jax.lax.stop_gradient((graph, T_start))
         scale = length_scale(fixed)
         followed = eqx.Partial(followed_width, scale)
-        T_wide = _better_start(fixed, T_start, scaled_rows(self.rows), fixed)
+        T_wide = _better_start(fixed, T_start, fixed)
         width = first_width(fixed, T_wide)
         if not compare:
             end = self._from_width(fixed, T_wide, width)
@@ -210,14 +162,13 @@ class Correntropy(AbstractAverager):
         self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
     ) -> Iterated:
         near = without_lone_closures(jax.lax.stop_gradient(graph))
-        rows = scaled_rows(self.rows)
         if init is None:
             T_start = start(self.initialiser, near, None, key)
-            starts = [_better_start(graph, T_start, rows, near), along_frames(graph)]
+            starts = [_better_start(graph, T_start, near), along_frames(graph)]
         else:
             # A start of the caller's may be far off: plain steps that leave out what
             # pulls against them would bend it for good.
-            starts = [_better_start(graph, init, rows, graph)]
+            starts = [_better_start(graph, init, graph)]
         return graduated(graph, near, jnp.stack(starts), self.max_steps)
 
 
@@ -229,38 +180,9 @@ class _Tried(NamedTuple):
     redundancy: Array
 
 
-def _solution(graph: PoseGraph, end: Iterated) -> AveragingSolution:
-    return solution(
-        graph,
-        end.T_world_i,
-        edge_weight=end.trust,
-        converged=end.converged,
-        kernel_width=end.width,
-        num_steps=end.num_steps,
-        trace=end.trace,
-    )
-
-
-def _paper_width(
-    alpha: Array | float, scale: Array, g: PoseGraph, T: Array, _: Array
-) -> Float[Array, "2"]:
-    """Sigma = alpha times the mean residual (Eq. 22)."""
-    e = weighted_mean(frobenius(g, T, scale), g.weight)
-    sigma = alpha * jnp.maximum(e, 64 * jnp.finfo(e.dtype).eps)
-    # The Frobenius norm of a small rotation is sqrt(2) times its angle.
-    return jnp.stack([sigma * scale, sigma / jnp.sqrt(jnp.asarray(2, e.dtype))])
-
-
-def _paper_trust(
-    alpha: Array | float, scale: Array, g: PoseGraph, T: Array, width: Array
-) -> Float[Array, " e"]:
-    return gaussian_trust(g, T, _paper_width(alpha, scale, g, T, width))
-
-
 def _better_start(
     graph: PoseGraph,
     T_start: Float[Array, "v D D"],
-    rows: RowsOf,
     near: PoseGraph,
 ) -> Float[Array, "v D D"]:
     """The start, or what a few plain steps make of it if more edges agree with that.
@@ -269,7 +191,7 @@ def _better_start(
     kernel would drop them. Plain averaging spreads the drift; with wrong edges about,
     it agrees with few, and the start stands. The steps have the weights of `near`.
     """
-    plain = iterate_plain(near, T_start, rows, max_steps=5, tolerance=1e-2)
+    plain = iterate_plain(near, T_start, RootRows(), max_steps=5, tolerance=1e-2)
     both = jnp.stack([T_start, plain.T_world_i])
     spare = jax.vmap(lambda T: redundancy(graph, T))(both)
     return jnp.where(spare[1] > spare[0], both[1], both[0])

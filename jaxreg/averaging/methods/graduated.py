@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxreg.averaging.base import (
     length_scale,
-    masked_quantile,
+    nearest_rank,
     num_held,
     weighted_mean,
 )
@@ -27,14 +27,14 @@ from jaxreg.averaging.methods.pose_graph_lm import (
     no_cycle,
     robust_problem,
 )
-from jaxreg.averaging.steps.edge_errors import LOG_ERROR
+from jaxreg.averaging.steps.edge_errors import LogError
 from jaxreg.averaging.steps.gauss_newton import gauss_newton_gradients, precisions
 from jaxreg.averaging.steps.iterate import Iterated, pose_change
 from jaxreg.averaging.steps.kernel_width import CHI2_MEDIAN
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.robust import Correntropy
+from jaxreg.robust import Welsch
 
 
 # The last width in deviations: right edges lose nothing, and the wrong ones of large
@@ -140,7 +140,7 @@ def _problem(
     graph: PoseGraph, parts: Array, width: Array, doubt: Array | float = 1.0
 ) -> Problem:
     W = precisions(graph, jnp.ones_like(graph.weight), parts)
-    full = robust_problem(graph, LOG_ERROR, W, Correntropy(), width)
+    full = robust_problem(graph, LogError(), W, Welsch(), width)
     return full._replace(
         loss=lambda s: doubt * full.loss(s), trust=lambda s: doubt * full.trust(s)
     )
@@ -219,13 +219,13 @@ def _first_width(graph: PoseGraph, believed: Array, T: Array, squares: Array) ->
     present = (graph.weight > 0) & believed
     open_edges = _open_edges(graph, T) & believed
     chained = jnp.sum(present & ~open_edges) > 0.5 * (num_held(graph) - 1)
-    middle = masked_quantile(squares, present, 0.5)
+    middle = nearest_rank(squares, present, 0.5)
     middle = middle / CHI2_MEDIAN[lie.tangent_dim(graph.dim)]
     spread = _FIRST * jnp.sqrt(middle * _spare(graph))
     doubted = jnp.any((graph.weight > 0) & ~believed)
     sifted, unsifted = jnp.asarray([_SIFTED, _UNSIFTED], squares.dtype)
     times, right = jnp.where(doubted, sifted, unsifted)
-    drift = times * jnp.sqrt(masked_quantile(squares, open_edges, right))
+    drift = times * jnp.sqrt(nearest_rank(squares, open_edges, right))
     floor = 64 * jnp.finfo(squares.dtype).eps
     return jnp.maximum(jnp.where(chained, drift, spread), floor)
 
@@ -262,8 +262,8 @@ def _parts(graph: PoseGraph, T: Array, trust: Array) -> Float[Array, "2"]:
     dof = lie.tangent_dim(d) - d
     middle = jnp.stack(
         [
-            masked_quantile(translation, present, 0.5) / CHI2_MEDIAN[d],
-            masked_quantile(rotation, present, 0.5) / (2 * CHI2_MEDIAN[dof]),
+            nearest_rank(translation, present, 0.5) / CHI2_MEDIAN[d],
+            nearest_rank(rotation, present, 0.5) / (2 * CHI2_MEDIAN[dof]),
         ]
     )
     floor = 64 * jnp.finfo(middle.dtype).eps

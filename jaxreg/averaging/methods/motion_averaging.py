@@ -4,8 +4,6 @@ Reference: Govindu 2004; Govindu and Pooja 2014; Guo, Zhu, Li et al. 2018 (weigh
 equations as in the MCC paper, 14-21.
 """
 
-from typing import Literal
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,17 +12,18 @@ from jaxtyping import Array, Float
 from jaxreg._core.arrays import traced
 from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution, start
-from jaxreg.averaging.methods.spanning_tree import SpanningTree
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, start
+from jaxreg.averaging.methods.shortest_paths import ShortestPaths
 from jaxreg.averaging.steps.iterate import (
     STEP_TOLERANCE,
     Iterated,
-    RowsOf,
     averaged,
     averaging_gradients,
     held_width,
     iterate,
+    solution_of,
 )
+from jaxreg.averaging.steps.rows import AbstractRows, EqualRows, RootRows
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import flow_solver
 
@@ -44,7 +43,7 @@ class MotionAveraging(AbstractAverager):
 
     max_steps: int = eqx.field(static=True, default=50)
     tolerance: Array | float = traced(1e-8)
-    initialiser: AbstractAverager = SpanningTree(by="path")
+    initialiser: AbstractAverager = ShortestPaths()
 
     @compiled
     def solve(
@@ -54,11 +53,8 @@ class MotionAveraging(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Averages a prepared graph."""
-
-        def rows(g: PoseGraph, trust: Array) -> Array:
-            return (g.weight > 0).astype(trust.dtype)
-
         T_start = start(self.initialiser, graph, init, key)
+        rows = EqualRows()
         return _least_squares(graph, T_start, rows, self.max_steps, self.tolerance)
 
 
@@ -66,8 +62,8 @@ class WeightedMotionAveraging(AbstractAverager):
     """Motion averaging in which each edge counts by its prior `weight`.
 
     Attributes:
-        rows: "sqrt" to minimise the sum of weight * |residual|^2, "weight" to scale the
-            rows of the system by the weight itself, as the paper does (Eq. 17).
+        rows: `RootRows()` to minimise the sum of weight * |residual|^2, `WeightRows()`
+            to scale the rows by the weight itself, as the MCC paper does (Eq. 17).
         max_steps: largest number of steps (static).
         tolerance: stop below this change, radians and share of the size of the scene.
         initialiser: finds the start when `init` is None.
@@ -75,13 +71,10 @@ class WeightedMotionAveraging(AbstractAverager):
     Gradients: implicit at the fixed point with respect to `T_i_j` and `weight`.
     """
 
-    rows: Literal["sqrt", "weight"] = eqx.field(static=True, default="sqrt")
+    rows: AbstractRows = RootRows()
     max_steps: int = eqx.field(static=True, default=50)
     tolerance: Array | float = traced(1e-8)
-    initialiser: AbstractAverager = SpanningTree(by="path")
-
-    def __check_init__(self) -> None:
-        check_rows(self.rows)
+    initialiser: AbstractAverager = ShortestPaths()
 
     @compiled
     def solve(
@@ -92,57 +85,31 @@ class WeightedMotionAveraging(AbstractAverager):
     ) -> AveragingSolution:
         """Averages a prepared graph."""
         T_start = start(self.initialiser, graph, init, key)
-        rows = scaled_rows(self.rows)
-        return _least_squares(graph, T_start, rows, self.max_steps, self.tolerance)
-
-
-def check_rows(rows: str) -> None:
-    """Requires one of the two ways to scale rows."""
-    if rows not in ("sqrt", "weight"):
-        raise ValueError(f"rows: wanted 'sqrt' or 'weight', found {rows!r}.")
-
-
-def scaled_rows(rows: str) -> RowsOf:
-    """Laplacian weights for rows scaled by the weight or by its root."""
-
-    def sqrt(g: PoseGraph, trust: Array) -> Array:
-        return g.weight * trust
-
-    def weight(g: PoseGraph, trust: Array) -> Array:
-        return (g.weight * trust) ** 2
-
-    return sqrt if rows == "sqrt" else weight
+        return _least_squares(graph, T_start, self.rows, self.max_steps, self.tolerance)
 
 
 def _least_squares(
     graph: PoseGraph,
     T_start: Float[Array, "v D D"],
-    rows: RowsOf,
+    rows: AbstractRows,
     max_steps: int,
     tolerance: Array | float,
 ) -> AveragingSolution:
     end = iterate_plain(graph, T_start, rows, max_steps=max_steps, tolerance=tolerance)
-    end = averaging_gradients(graph, end, _full_trust, rows)
-    return solution(
-        graph,
-        end.T_world_i,
-        converged=end.converged,
-        num_steps=end.num_steps,
-        trace=end.trace,
-    )
+    return solution_of(graph, averaging_gradients(graph, end, _full_trust, rows))
 
 
 def iterate_plain(
     graph: PoseGraph,
     T_start: Float[Array, "v D D"],
-    rows: RowsOf,
+    rows: AbstractRows,
     *,
     max_steps: int,
     tolerance: Array | float,
 ) -> Iterated:
     """Averaging in which every edge is trusted; no gradients."""
     graph = jax.lax.stop_gradient(graph)
-    weight = rows(graph, jnp.ones_like(graph.weight))
+    weight = rows.squared(graph, jnp.ones_like(graph.weight))
     solve = flow_solver(graph.edges, weight, graph.num_poses, STEP_TOLERANCE)
 
     return iterate(

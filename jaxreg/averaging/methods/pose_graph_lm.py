@@ -11,7 +11,7 @@ without one a step on sphere2500 had not converged after 2,000 rounds (12 s; her
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,13 +30,7 @@ from jaxreg.averaging.base import (
     weighted_mean,
 )
 from jaxreg.averaging.methods.motion_averaging import MotionAveraging
-from jaxreg.averaging.steps.edge_errors import (
-    CHORDAL_ERROR,
-    LOG_ERROR,
-    EdgeError,
-    chordal_precision,
-    log_precision,
-)
+from jaxreg.averaging.steps.edge_errors import AbstractEdgeError, LogError
 from jaxreg.averaging.steps.implicit import differentiable
 from jaxreg.averaging.steps.iterate import nearby_rotation, pose_change
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
@@ -63,10 +57,10 @@ class PoseGraphLM(AbstractAverager):
     """Least squares over the graph, with information matrices.
 
     Attributes:
-        objective: "log" for the sum of r' Omega r with the tangent error
+        error: what is minimised, the sum of r' Omega r. `LogError()`: the tangent error
             r = log(inv(T_i_j) inv(T_world_i) T_world_j) of g2o and GTSAM, Omega the
-            weight times the information (the identity without); "chordal" for the
-            objective of SE-Sync, `jaxreg.metrics.chordal_objective` (static).
+            weight times the information (the identity without); `ChordalError()`: the
+            objective of SE-Sync, `jaxreg.metrics.chordal_objective`.
         kernel: a robust kernel of `jaxreg.robust` over sqrt(r' Omega r) of each edge,
             or None for plain least squares, which outliers pull away.
         kernel_width: its width; in standard deviations if the information is that of
@@ -85,18 +79,12 @@ class PoseGraphLM(AbstractAverager):
     Reference: Kuemmerle, Grisetti et al. 2011 (g2o); Rosen et al. 2019 (SE-Sync).
     """
 
-    objective: Literal["log", "chordal"] = eqx.field(static=True, default="log")
+    error: AbstractEdgeError = LogError()
     kernel: AbstractKernel | None = None
     kernel_width: Array | float = traced(3.0)
     max_steps: int = eqx.field(static=True, default=50)
     tolerance: Array | float = traced(1e-6)
     initialiser: AbstractAverager = MotionAveraging(max_steps=3)
-
-    def __check_init__(self) -> None:
-        if self.objective not in ("log", "chordal"):
-            raise ValueError(
-                f"objective: wanted 'log' or 'chordal', found {self.objective!r}."
-            )
 
     @compiled
     def solve(
@@ -137,10 +125,7 @@ class PoseGraphLM(AbstractAverager):
         return -divergence(graph.edges, force, graph.num_poses)
 
     def _problem(self, graph: PoseGraph) -> "Problem":
-        if self.objective == "chordal":
-            error, precision = CHORDAL_ERROR, chordal_precision(graph)
-        else:
-            error, precision = LOG_ERROR, log_precision(graph)
+        error, precision = self.error, self.error.precision(graph)
         if self.kernel is None:
             return Problem(graph, error, precision, lambda s: s, jnp.ones_like)
         width = jnp.asarray(self.kernel_width)
@@ -159,7 +144,7 @@ class Problem(NamedTuple):
     """The sum of loss(r' Omega r) over the edges; trust is its derivative."""
 
     graph: PoseGraph
-    error: EdgeError
+    error: AbstractEdgeError
     precision: Array  # (e, m, m), or (e, m) if diagonal
     loss: Callable[[Array], Array]
     trust: Callable[[Array], Array]
@@ -195,7 +180,7 @@ class Problem(NamedTuple):
 
 def robust_problem(
     graph: PoseGraph,
-    error: EdgeError,
+    error: AbstractEdgeError,
     precision: Float[Array, "e ..."],
     kernel: AbstractKernel,
     width: Float[Array, ""],

@@ -8,8 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.averaging.base import length_scale, weighted_mean
+from jaxreg.averaging.base import (
+    AveragingSolution,
+    length_scale,
+    solution,
+    weighted_mean,
+)
 from jaxreg.averaging.steps.implicit import differentiable
+from jaxreg.averaging.steps.rows import AbstractRows
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
@@ -22,8 +28,6 @@ STEP_TOLERANCE = 1e-4
 WidthOf = Callable[[PoseGraph, Array, Array], Array]
 #: Trust of each edge `(e,)` at given poses and widths.
 TrustOf = Callable[[PoseGraph, Array, Array], Array]
-#: Weights `(e,)` of the Laplacian from prior weight and trust.
-RowsOf = Callable[[PoseGraph, Array], Array]
 #: New poses from poses, trust and widths.
 Step = Callable[[PoseGraph, Array, Array, Array], Array]
 
@@ -44,6 +48,19 @@ class Iterated(NamedTuple):
     trace: AveragingTrace
 
 
+def solution_of(graph: PoseGraph, end: Iterated) -> AveragingSolution:
+    """The solution where the loop stopped."""
+    return solution(
+        graph,
+        end.T_world_i,
+        edge_weight=end.trust,
+        converged=end.converged,
+        kernel_width=end.width,
+        num_steps=end.num_steps,
+        trace=end.trace,
+    )
+
+
 class _State(NamedTuple):
     T: Array
     width: Array
@@ -60,7 +77,7 @@ def nearby_rotation(T: Float[Array, "*b D D"]) -> Float[Array, "*b D D"]:
     return lie.compose(product(R, 1.5 * eye - 0.5 * gram), lie.translation(T))
 
 
-def averaging_step(rows_of: RowsOf) -> Step:
+def averaging_step(rows: AbstractRows) -> Step:
     """One weighted step of motion averaging (Eq. 14-20), updated on the left.
 
     T_world_i <- exp(dm_i) T_world_i: Eq. 21 with the update on the side that Eq. 14
@@ -68,7 +85,7 @@ def averaging_step(rows_of: RowsOf) -> Step:
     """
 
     def step(graph: PoseGraph, T: Array, trust: Array, width: Array) -> Array:
-        weight, num = rows_of(graph, trust), graph.num_poses
+        weight, num = rows.squared(graph, trust), graph.num_poses
 
         def solve(flow: Array) -> Array:
             return solve_flow(graph.edges, weight, flow, num, STEP_TOLERANCE)
@@ -87,26 +104,31 @@ def averaged(
 
 
 def averaging_gradients(
-    graph: PoseGraph, end: Iterated, trust_of: TrustOf, rows_of: RowsOf
+    graph: PoseGraph, end: Iterated, trust_of: TrustOf, rows: AbstractRows
 ) -> Iterated:
     """The same result with derivatives by the balance of flows at the fixed point.
 
     `trust_of` is a pytree of the values that it uses.
     """
     fixed = jax.lax.stop_gradient(graph)
-    held = rows_of(fixed, end.trust)
+    held = rows.squared(fixed, end.trust)
     top = jnp.max(held)
     top = jnp.where(top > 0, top, 1)
-    imbalance = eqx.Partial(_net_flow, trust_of, rows_of, end.width, top)
+    imbalance = eqx.Partial(_net_flow, trust_of, rows, end.width, top)
     T = differentiable(graph, end.T_world_i, imbalance, held / top)
     return end._replace(T_world_i=T, trust=trust_of(graph, T, end.width))
 
 
 def _net_flow(
-    trust_of: TrustOf, rows_of: RowsOf, width: Array, top: Array, g: PoseGraph, T: Array
+    trust_of: TrustOf,
+    rows: AbstractRows,
+    width: Array,
+    top: Array,
+    g: PoseGraph,
+    T: Array,
 ) -> Array:
     """What flows into each frame, by weights over the largest."""
-    weight = rows_of(g, trust_of(g, T, width)) / top
+    weight = rows.squared(g, trust_of(g, T, width)) / top
     flow = weight[:, None] * lie.log(g.residual_motions(T))
     return divergence(g.edges, flow, g.num_poses)
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.base import length_scale, masked_quantile, num_held
+from jaxreg.averaging.base import length_scale, nearest_rank, num_held
 from jaxreg.averaging.evidence import SCALES, redundancies
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -111,8 +111,8 @@ def _three_deviations(
     inside = (graph.weight > 0) & (trust > _INSIDE)
     middle = jnp.stack(
         [
-            masked_quantile(translation, inside, 0.5) / CHI2_MEDIAN[d],
-            masked_quantile(rotation, inside, 0.5) / (2 * CHI2_MEDIAN[dof]),
+            nearest_rank(translation, inside, 0.5) / CHI2_MEDIAN[d],
+            nearest_rank(rotation, inside, 0.5) / (2 * CHI2_MEDIAN[dof]),
         ]
     )
     variance = jnp.maximum(variance, middle) * count / jnp.maximum(spare, 1e-3)

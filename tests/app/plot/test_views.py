@@ -124,7 +124,7 @@ def test_reprs_take_a_line_or_two():
         jaxreg.ParticleFilter(),
         jaxreg.sandhu2010(3),
         jaxreg.ICP(kernel=jaxreg.robust.Huber()),
-        jaxreg.Correntropy(alpha=2.0),
+        jaxreg.MCC(alpha=2.0),
         jaxreg.BruteForce.build(points, mask),
         _registration(),
         _registration().modes,
@@ -137,4 +137,4 @@ def test_reprs_take_a_line_or_two():
         assert len(repr(thing)) <= 2 * 100
         assert repr(thing).count("\n") <= 1
     assert repr(jaxreg.ICP(kernel=jaxreg.robust.Huber())) == "ICP(kernel=Huber())"
-    assert repr(jaxreg.Correntropy(alpha=2.0)) == "Correntropy(alpha=2)"
+    assert repr(jaxreg.MCC(alpha=2.0)) == "MCC(alpha=2)"

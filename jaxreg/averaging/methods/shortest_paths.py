@@ -1,0 +1,31 @@
+"""Poses chained along the shortest paths from frame 0: the start of least squares."""
+
+from jaxtyping import Array, Float
+
+from jaxreg._core.compile import compiled
+from jaxreg._core.typing import Key
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
+from jaxreg.graph import trees
+from jaxreg.graph.pose_graph import PoseGraph
+
+
+class ShortestPaths(AbstractAverager):
+    """Chains relative motions along the shortest paths from frame 0.
+
+    An edge is 1 / weight long: the chains are those of least variance, and a
+    breadth-first tree for equal weights. Other edges are not used, and none is judged:
+    `edge_weight` is 1 for every edge. `init` is ignored.
+
+    Gradients: none (the topology and the start are cut).
+    """
+
+    @compiled
+    def solve(
+        self,
+        graph: PoseGraph,
+        init: Float[Array, "v D D"] | None,
+        key: Key | None,
+    ) -> AveragingSolution:
+        """Chains the motions of a prepared graph."""
+        args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
+        return solution(graph, trees.shortest_paths(*args).T_root_i)
