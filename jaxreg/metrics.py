@@ -7,10 +7,10 @@ frame (the gauge), so both sets are first brought into one.
 
 from typing import Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxreg._core.compile import compiled
 from jaxreg.geometry import lie
 from jaxreg.geometry.kabsch import nearest_rotation
 from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
@@ -56,7 +56,7 @@ def align_poses(
     return lie.compose(lie.rotation(moved), lie.translation(moved) + shift)
 
 
-@compiled
+@eqx.filter_jit
 def rotation_errors(
     T_world_i: Float[Array, "v D D"],
     T_true_i: Float[Array, "v D D"],
@@ -69,7 +69,7 @@ def rotation_errors(
     return lie.rotation_angle(R)
 
 
-@compiled
+@eqx.filter_jit
 def translation_errors(
     T_world_i: Float[Array, "v D D"],
     T_true_i: Float[Array, "v D D"],
@@ -117,7 +117,7 @@ def _mean(x: Array, mask: Array | None) -> Array:
     return jnp.sum(jnp.where(mask, x, 0)) / count
 
 
-@compiled
+@eqx.filter_jit
 def chordal_objective(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"]
 ) -> Float[Array, ""]:

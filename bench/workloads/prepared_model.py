@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxreg._core.compile import compiled
 from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.geometry import lie
 from jaxreg.matching import PointToPoint
@@ -65,7 +64,7 @@ class Model(NamedTuple):
     radius: Array
 
 
-@compiled
+@eqx.filter_jit
 def prepare(method: AbstractSearch, target: Array) -> Model:
     """Of `(m, 3)` points."""
     mask = jnp.ones(len(target), bool)
@@ -75,7 +74,7 @@ def prepare(method: AbstractSearch, target: Array) -> Model:
     return Model(cloud, index, centre, radius)
 
 
-@compiled
+@eqx.filter_jit
 def search(method: AbstractSearch, model: Model, sources: Array, key: Array) -> Array:
     """Poses of `(b, n, 3)` sources in turn; their normals are not used."""
 

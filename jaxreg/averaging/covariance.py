@@ -1,10 +1,10 @@
 """How well a graph determines the poses that were averaged from it."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg._core.compile import compiled
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
 from jaxreg.geometry import lie
@@ -15,7 +15,7 @@ from jaxreg.graph.pose_graph import PoseGraph
 COVARIANCE_LIMIT = 6000
 
 
-@compiled
+@eqx.filter_jit
 def pose_covariances(
     graph: PoseGraph, solution: AveragingSolution
 ) -> Float[Array, "v k k"]:

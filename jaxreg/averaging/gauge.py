@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.arrays import cast_floats
-from jaxreg._core.compile import compiled
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
@@ -34,7 +33,7 @@ class _Gauge(NamedTuple):
     finite: Array
 
 
-@compiled
+@eqx.filter_jit
 def _prepared(
     graph: PoseGraph, method: AbstractAverager, init: Float[Array, "v D D"] | None
 ) -> tuple[PoseGraph, AbstractAverager, Float[Array, "v D D"] | None, _Gauge]:
@@ -52,7 +51,7 @@ def _prepared(
     return reduced, method, T_start, _Gauge(T_world_0, component, finite)
 
 
-@compiled
+@eqx.filter_jit
 def _placed(
     out: AveragingSolution, gauge: _Gauge, present: Bool[Array, " v"] | None
 ) -> AveragingSolution:

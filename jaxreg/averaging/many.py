@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterator, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import as_float_array, is_concrete
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
@@ -142,7 +142,7 @@ def _padded(
     return batch, present, starts
 
 
-@compiled
+@eqx.filter_jit
 def _average_lanes(
     method: AbstractAverager,
     graphs: PoseGraph,

@@ -1,9 +1,9 @@
 """From the motions of pairs to the answer: poses, statuses, trust."""
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
@@ -49,7 +49,7 @@ def finish(
     return hold.in_world(solution)
 
 
-@compiled
+@eqx.filter_jit
 def _solution(
     scans: PreparedScans,
     motions: RelativeMotions,

@@ -5,12 +5,12 @@ hold, so two bodies that are not held by one pair may be by all of theirs togeth
 then are one; and so on.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
 from jaxreg.graph.trees import components
@@ -19,7 +19,7 @@ from jaxreg.multiview.place import Placement, in_main_body
 from jaxreg.multiview.prepare import PreparedScans
 
 
-@compiled
+@eqx.filter_jit
 def slipping(
     scans: PreparedScans, placement: Placement, min_overlap: Scalar
 ) -> Bool[Array, " v"]:

@@ -4,17 +4,17 @@ A pair of which another mode overlaps as much as the best settles nothing. Pairs
 are settled make bodies; scans that only the others join to them may be elsewhere.
 """
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from jaxreg._core.compile import compiled
 from jaxreg.graph.trees import components
 from jaxreg.multiview.place import Placement, believed, in_main_body
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.particle.conclude import RIVAL_OVERLAP
 
 
-@compiled
+@eqx.filter_jit
 def turnable(motions: RelativeMotions, placement: Placement) -> Bool[Array, " v"]:
     """`(v,)` scans that no settled pairs join to the main body of their part.
 

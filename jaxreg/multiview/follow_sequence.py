@@ -5,13 +5,13 @@ finds most pairs of a sequence in a fraction of a search. What it finds is belie
 once only if it overlaps by so much as no chance does; else it competes with the search.
 """
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import cast_floats
-from jaxreg._core.compile import compiled
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import PlaneToPlane, Problem, mutual_overlap, score_both_ways
@@ -27,7 +27,7 @@ SURE = 0.5
 _STEPS, _POLISH = 24, 8
 
 
-@compiled
+@eqx.filter_jit
 def descended(
     method: ParticleFilter,
     scans: PreparedScans,

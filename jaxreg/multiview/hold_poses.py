@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.geometry import lie
@@ -81,7 +80,7 @@ class Held(eqx.Module):
         return eqx.tree_at(lambda s: s.T_world_i, solution, T)
 
 
-@compiled
+@eqx.filter_jit
 def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
     """With the held poses; each other scan follows the held one nearest to it."""
     ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
@@ -101,7 +100,7 @@ def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
     return eqx.tree_at(lambda p: (p.T_world_i, p.part), found, (T, part))
 
 
-@compiled
+@eqx.filter_jit
 def _contracted(
     hold: Held, before: Placement, motions: RelativeMotions
 ) -> RelativeMotions:
@@ -118,7 +117,7 @@ def _contracted(
     )
 
 
-@compiled
+@eqx.filter_jit
 def _expanded(hold: Held, before: Placement, nodes: Placement) -> Placement:
     """Poses of the scans by those of the nodes."""
     beside = nodes.together(hold.node, jnp.zeros_like(hold.node))

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Scalar, StatusArray
 from jaxreg.averaging import (
     AbstractAverager,
@@ -78,7 +77,7 @@ class Placement(eqx.Module):
         return self.part[i] == self.part[j]
 
 
-@compiled
+@eqx.filter_jit
 def place(
     motions: RelativeMotions,
     num_scans: int,

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motions, Scalar
 from jaxreg.cloud import PointCloud, centroid, median_spacing, rms_radius
@@ -114,7 +113,7 @@ def prepare_scan(
     return cloud, table, mean, median_spacing(cloud.points, cloud.mask)
 
 
-@compiled
+@eqx.filter_jit
 def prepare_scans(
     method: ParticleFilter,
     points: Float[Array, "v n d"],

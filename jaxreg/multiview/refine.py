@@ -14,7 +14,6 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxreg._core.arrays import cast_floats
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
 from jaxreg.geometry import lie
@@ -65,7 +64,7 @@ def wide_unless_given(averaging: AbstractAverager | None) -> AbstractAverager:
     return averaging
 
 
-@compiled
+@eqx.filter_jit
 def _updated(before: Placement, after: Placement) -> Placement:
     """The later poses of the scans that both hold, in the earlier frames.
 
@@ -85,7 +84,7 @@ def _updated(before: Placement, after: Placement) -> Placement:
     return eqx.tree_at(lambda p: (p.T_world_i, p.part), before, (T, first))
 
 
-@compiled
+@eqx.filter_jit
 def measured(
     scans: PreparedScans, placement: Placement, min_overlap: Scalar, *, exact: bool
 ) -> RelativeMotions:

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.threads import map_in_threads
@@ -172,7 +172,7 @@ class Rounds:
         return trusted | trusted.T, likely + likely.T, np.asarray(placement.part)
 
 
-@compiled
+@eqx.filter_jit
 def _prospects(
     method: ParticleFilter,
     averaging: AbstractAverager | None,

@@ -1,12 +1,12 @@
 """Relative motions between pairs of scans: batches of the pairwise search."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.brief import BriefModule
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.particle import ParticleFilter
@@ -49,7 +49,7 @@ class RelativeMotions(BriefModule):
         parts = self.T_i_j, self.overlap, self.inlier_rmse
         return RelativeMotions(self.pairs, *(x[e, mode][:, None] for x in parts))
 
-    @compiled
+    @eqx.filter_jit
     def rows(self, rows: Int[Array, " r"]) -> "RelativeMotions":
         """Some of them."""
         return jax.tree.map(lambda x: x[rows], self)
@@ -108,7 +108,7 @@ class RelativeMotions(BriefModule):
         return i, j
 
 
-@compiled
+@eqx.filter_jit
 def relative_motions(
     method: ParticleFilter,
     scans: PreparedScans,

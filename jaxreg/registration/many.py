@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Hashable, Iterator
 from typing import TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,6 @@ from jaxtyping import Array
 from jaxreg._core.checks import (
     is_concrete,
 )
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Progress
 from jaxreg.batching.padding import (
     rounded_up,
@@ -177,7 +177,7 @@ def _over_cores(
     return map_in_threads(run, range(0, num, chunk), cores)
 
 
-@compiled
+@eqx.filter_jit
 def _register_rows(
     method: AbstractRegistrar, pairs: _Pairs, impl: Hashable, batch_size: int
 ) -> RegistrationSolution:

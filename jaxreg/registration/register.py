@@ -1,5 +1,6 @@
 """`register`: what its users call."""
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -10,7 +11,6 @@ from jaxreg._core.checks import (
     check_pair,
     is_concrete,
 )
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key, Progress
 from jaxreg.batching.padding import (
     check_lists,
@@ -145,7 +145,7 @@ def _rounded_up(pair: tuple[Array, ...]) -> tuple[Array, ...]:
     return tuple(stacked([x], rounded_up(len(x)))[0] for x in pair)
 
 
-@compiled
+@eqx.filter_jit
 def _register_one(
     method: AbstractRegistrar,
     pair: tuple[Array, ...],

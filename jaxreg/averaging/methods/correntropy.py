@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -92,13 +91,13 @@ class Correntropy(AbstractAverager):
         T_start = start(self.initialiser, graph, init, key)
         return self._small(graph, T_start, init is None)
 
-    @compiled
+    @eqx.filter_jit
     def _large(
         self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
     ) -> AveragingSolution:
         return solution_of(graph, self._graduated(graph, init, key))
 
-    @compiled
+    @eqx.filter_jit
     def _small(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"], compare: bool
     ) -> AveragingSolution:

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.arrays import traced
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -54,7 +53,7 @@ class LowRankSparse(AbstractAverager):
     max_steps: int = eqx.field(static=True, default=1000)
     tolerance: Array | float = traced(1e-5)
 
-    @compiled
+    @eqx.filter_jit
     def solve(
         self,
         graph: PoseGraph,

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -70,7 +69,7 @@ class MCC(AbstractAverager):
         """Averages a prepared graph."""
         return self._from_start(graph, start(self.initialiser, graph, init, key))
 
-    @compiled
+    @eqx.filter_jit
     def _from_start(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"]
     ) -> AveragingSolution:

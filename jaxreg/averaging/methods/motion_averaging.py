@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, start
 from jaxreg.averaging.methods.shortest_paths import ShortestPaths
@@ -45,7 +44,7 @@ class MotionAveraging(AbstractAverager):
     tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = ShortestPaths()
 
-    @compiled
+    @eqx.filter_jit
     def solve(
         self,
         graph: PoseGraph,
@@ -76,7 +75,7 @@ class WeightedMotionAveraging(AbstractAverager):
     tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = ShortestPaths()
 
-    @compiled
+    @eqx.filter_jit
     def solve(
         self,
         graph: PoseGraph,

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -86,7 +85,7 @@ class PoseGraphLM(AbstractAverager):
     tolerance: Array | float = traced(1e-6)
     initialiser: AbstractAverager = MotionAveraging(max_steps=3)
 
-    @compiled
+    @eqx.filter_jit
     def solve(
         self,
         graph: PoseGraph,

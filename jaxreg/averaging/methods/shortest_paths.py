@@ -1,8 +1,8 @@
 """Poses chained along the shortest paths from frame 0: the start of least squares."""
 
+import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
 from jaxreg.graph import trees
@@ -19,7 +19,7 @@ class ShortestPaths(AbstractAverager):
     Gradients: none (the topology and the start are cut).
     """
 
-    @compiled
+    @eqx.filter_jit
     def solve(
         self,
         graph: PoseGraph,

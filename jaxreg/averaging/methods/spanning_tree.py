@@ -1,8 +1,8 @@
 """Poses chained along a spanning tree: the start of robust methods."""
 
+import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
 from jaxreg.graph import trees
@@ -18,7 +18,7 @@ class SpanningTree(AbstractAverager):
     Gradients: none (the topology and the start are cut).
     """
 
-    @compiled
+    @eqx.filter_jit
     def solve(
         self,
         graph: PoseGraph,

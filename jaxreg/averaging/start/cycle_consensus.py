@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import is_concrete
-from jaxreg._core.compile import compiled
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -87,7 +86,7 @@ class CycleConsensus(AbstractAverager):
             found = self._searched(graph, found)
         return _believed(graph, found)
 
-    @compiled
+    @eqx.filter_jit
     def _begun(self, graph: PoseGraph, key: Key | None) -> "_Found":
         graph = jax.lax.stop_gradient(graph)
         scale, odds = length_scale(graph), edge_log_odds(graph)
@@ -108,7 +107,7 @@ class CycleConsensus(AbstractAverager):
         own = odds[jnp.minimum(best, odds.shape[0] - 1)]
         return _Found(search, T, odds, own)
 
-    @compiled
+    @eqx.filter_jit
     def _searched(self, graph: PoseGraph, begun: "_Found") -> "_Found":
         graph = jax.lax.stop_gradient(graph)
         scale = length_scale(graph)
@@ -210,13 +209,13 @@ class _Found(NamedTuple):
     own: Array  # the odds of the scale of the best start
 
 
-@compiled
+@eqx.filter_jit
 def _by_trees(graph: PoseGraph) -> AveragingSolution:
     graph = jax.lax.stop_gradient(graph)
     return solution(graph, _without_cycles(graph), num_steps=0)
 
 
-@compiled
+@eqx.filter_jit
 def _believed(graph: PoseGraph, found: _Found) -> AveragingSolution:
     graph = jax.lax.stop_gradient(graph)
     belief = jnp.where(graph.weight > 0, jax.nn.sigmoid(found.own), 0)
