@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import lie
-from jaxreg.geometry.kabsch import nearest_rotation
+from jaxreg.geometry.nearest_rotation import nearest_rotation
 from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
 
 

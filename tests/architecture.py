@@ -13,7 +13,8 @@ PACKAGE = Path(__file__).parents[1] / "jaxreg"
 #: Rooms by floor, the lowest first. A module belongs to the longest name that fits.
 FLOORS: tuple[tuple[str, ...], ...] = (
     ("_core",),
-    ("linear", "geometry", "batching", "robust"),
+    ("linear", "batching", "robust"),
+    ("geometry",),
     ("neighbours", "graph"),
     ("cloud", "averaging.trace", "datasets", "metrics"),
     ("registrar", "matching", "averaging.base"),

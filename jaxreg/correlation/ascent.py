@@ -20,6 +20,7 @@ from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import PointCloud
 from jaxreg.correlation.quadratic import Quadratic
 from jaxreg.geometry import lie
+from jaxreg.linear.small import eigh
 from jaxreg.local import turn_and_shift
 
 
@@ -139,5 +140,5 @@ def _principal(model: Quadratic) -> tuple[Array, Array, Array]:
     """Curvatures and directions in units in which the stiffness is one, and those."""
     stiff = model.stiffness > 0
     unit = jnp.where(stiff, 1 / jnp.sqrt(jnp.where(stiff, model.stiffness, 1)), 0)
-    curvature, vector = jnp.linalg.eigh(model.H * unit[:, None] * unit)
+    curvature, vector = eigh(model.H * unit[:, None] * unit)
     return curvature, vector, unit

@@ -17,6 +17,7 @@ import jaxlie
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Key, Motions
+from jaxreg.geometry.nearest_rotation import nearest_rotation
 
 
 P = ParamSpec("P")
@@ -194,14 +195,11 @@ def identity(d: int, dtype: jnp.dtype | type, batch: tuple[int, ...] = ()) -> Mo
 
 
 def orthonormalise(T: Motions) -> Motions:
-    """The motion whose rotation is nearest in Frobenius norm (no gradient at ties).
+    """The motion whose rotation is nearest in Frobenius norm.
 
     Products of many float32 motions drift from the group; loops call this.
     """
-    U, _, Vt = jnp.linalg.svd(rotation(T), full_matrices=False)
-    sign = jnp.sign(jnp.linalg.det(U) * jnp.linalg.det(Vt))
-    U = U.at[..., -1].multiply(sign[..., None])
-    return compose(U @ Vt, translation(T))
+    return compose(nearest_rotation(rotation(T)), translation(T))
 
 
 def random_rotations(

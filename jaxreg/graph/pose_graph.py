@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import as_float_array, check_mask, is_concrete
 from jaxreg.geometry import lie
+from jaxreg.linear.small import inverse
 
 
 #: A motion whose rotation is this far from orthonormal is projected, further refused.
@@ -223,12 +224,12 @@ def chordal_weights(
     k = graph.information.shape[-1]
     eye = jnp.eye(k, dtype=graph.weight.dtype)
     info = jnp.where(real[:, None, None], graph.information, eye)
-    tau = d / jnp.trace(jnp.linalg.inv(info[:, :d, :d]), axis1=-2, axis2=-1)
+    tau = d / jnp.trace(inverse(info[:, :d, :d]), axis1=-2, axis2=-1)
     if d == 2:
         kappa = info[:, 2, 2]
     else:
-        inverse = jnp.linalg.inv(info[:, d:, d:])
-        kappa = 1.5 / jnp.trace(inverse, axis1=-2, axis2=-1)
+        covariance = inverse(info[:, d:, d:])
+        kappa = 1.5 / jnp.trace(covariance, axis1=-2, axis2=-1)
     return graph.weight * kappa, graph.weight * tau
 
 

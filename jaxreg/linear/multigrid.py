@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg.linear.aggregation import RATIO, aggregate
 from jaxreg.linear.krylov import conjugate_gradients
+from jaxreg.linear.small import inverse_semidefinite
 
 
 # Unknowns up to which a matrix is inverted; steps on each coarser level.
@@ -132,7 +133,7 @@ def _coarser(matrix: Laplacian) -> tuple[_Level, Laplacian]:
     i, j = edges[:, 0], edges[:, 1]
     diagonal = matrix.diagonal()
     held = jnp.trace(diagonal, axis1=-2, axis2=-1) > 0
-    inverse = jnp.where(held[:, None, None], ridged_inverse(diagonal), 0)
+    inverse = _block_inverses(diagonal)
     # The share of each edge in what holds its frames, whatever the coordinates.
     share = jnp.minimum(
         jnp.sum(inverse[i] * weight, axis=(1, 2)),
@@ -153,6 +154,15 @@ def _coarser(matrix: Laplacian) -> tuple[_Level, Laplacian]:
     )
     level = _Level(matrix, _DAMPED * inverse, agg.parent, held.astype(own.dtype))
     return level, Laplacian(agg.edges, blocks, own)
+
+
+def _block_inverses(A: Float[Array, "v k k"]) -> Float[Array, "v k k"]:
+    """Inverses of semidefinite blocks, zero where nothing holds."""
+    diagonal = jnp.diagonal(A, axis1=-2, axis2=-1)
+    # A unit diagonal first, so that parts in other units keep their digits.
+    root = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    both = root[:, :, None] * root[:, None, :]
+    return inverse_semidefinite(A * both) * both
 
 
 def matmul(A: Float[Array, "v a b"], x: Float[Array, "v b c"]) -> Float[Array, "v a c"]:

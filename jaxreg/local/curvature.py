@@ -7,10 +7,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Motion
+from jaxreg.linear.small import eigh, solve_semidefinite
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.steps import condition, gyration_radius
 from jaxreg.local.steps.base import full_matmul
-from jaxreg.local.steps.tiny_solve import solve_semidefinite
 from jaxreg.matching.problem import Match, Problem, match, sum_rows
 from jaxreg.matching.residuals import AbstractResidual, PointToPlane, PointToPoint
 from jaxreg.matching.residuals.gram import along
@@ -181,12 +181,12 @@ def _inverse_within(
     """A^-1 in the directions that H holds, with A from 0.01 to 1 times H."""
     diagonal = jnp.diagonal(H)
     unit = jnp.where(diagonal > 0, lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1)), 0)
-    value, vector = jnp.linalg.eigh(H * unit[:, None] * unit)
+    value, vector = eigh(H * unit[:, None] * unit)
     held = value > len(H) * jnp.finfo(H.dtype).eps * value[-1]
     root = jnp.where(held, lax.rsqrt(jnp.where(held, value, 1)), 0)
     white = unit[:, None] * vector * root  # white.T H white = I
     share = full_matmul(white.T, full_matmul(A, white))
-    value, vector = jnp.linalg.eigh(share)
+    value, vector = eigh(share)
     white = full_matmul(white, vector)
     return full_matmul(white / jnp.clip(value, _LEAST_ANSWER, 1), white.T)
 

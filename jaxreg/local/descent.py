@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.adjoint import AbstractAdjoint
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
-from jaxreg.geometry.kabsch import nearest_rotation
+from jaxreg.geometry.nearest_rotation import nearest_rotation
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.scale import fit_scale
 from jaxreg.local.steps import decoupled_error

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Motion, Scalar
+from jaxreg.linear.small import eigh, least_norm_solution
 from jaxreg.local.descent import Descent, Limits
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.steps import turn_and_shift
@@ -72,11 +73,7 @@ def _correction_jvp(primals: tuple[_End], tangents: tuple) -> tuple[Array, Array
         return zero, jnp.zeros_like(zero)
     A = jax.jacfwd(lambda x: _pulls(x, at))(zero)
     # Directions that the data leave free do not follow.
-    U, s, Vt = jnp.linalg.svd(A)
-    held = s > _FREE * jnp.finfo(s.dtype).eps * s[0]
-    share = jnp.where(held, full_matmul(U.T, along[:, None])[:, 0], 0)
-    share = share / jnp.where(held, s, 1)
-    return zero, -full_matmul(Vt.T, share[:, None])[:, 0]
+    return zero, -least_norm_solution(A, along, _FREE * float(jnp.finfo(A.dtype).eps))
 
 
 def _with_turning_normals(problem: Problem) -> Problem:
@@ -106,7 +103,7 @@ def _turned(
     middle = jnp.sum(known * still, axis=1) / jnp.maximum(jnp.sum(known), 1)
     x = known * (still - middle[:, None])
     B = full_matmul(points - still, x.T)
-    spread, axes = jnp.linalg.eigh(full_matmul(x, x.T))
+    spread, axes = eigh(full_matmul(x, x.T))
     skew = full_matmul(axes.T, full_matmul(B - B.T, axes))
     total = spread[:, None] + spread[None, :]
     floor = _FREE * jnp.finfo(spread.dtype).eps * spread[-1]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.local.steps.tiny_solve import solve_semidefinite
+from jaxreg.linear.small import solve_semidefinite
 from jaxreg.matching.problem import Match
 from jaxreg.matching.residuals import AbstractResidual
 

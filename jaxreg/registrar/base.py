@@ -15,6 +15,7 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import PointCloud
 from jaxreg.geometry import lie
+from jaxreg.linear.small import solve_semidefinite
 from jaxreg.registrar.trace import SearchTrace
 
 
@@ -88,9 +89,7 @@ class Modes(BriefModule):
         # Of unit diagonal: lengths may be of any unit.
         unit = jnp.sqrt(jnp.diagonal(self.covariance, axis1=1, axis2=2))
         error, shape = error / unit, self.covariance / unit[:, :, None] / unit[:, None]
-        sq = jnp.sum(
-            error * jnp.linalg.solve(shape, error[:, :, None])[:, :, 0], axis=1
-        )
+        sq = jnp.sum(error * solve_semidefinite(shape, error), axis=1)
         near = gammainc(error.shape[1] / 2, sq / 2) <= probability
         heavier = self.weight[:, None] > self.weight
         before = jnp.sum(jnp.where(heavier, self.weight[:, None], 0), axis=0)

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from jaxreg.geometry.kabsch import kabsch, nearest_rotation
+from jaxreg.geometry.kabsch import kabsch
+from jaxreg.geometry.nearest_rotation import nearest_rotation
 
 
 N = 12

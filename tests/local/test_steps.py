@@ -9,6 +9,7 @@ from helpers import blob, motion, move, pose_error
 from matches import N, found_at, noisy_problem, normals_of, problem_of
 
 from jaxreg.geometry.kabsch import kabsch
+from jaxreg.linear.small import solve_semidefinite
 from jaxreg.local import (
     ClosedForm,
     GaussNewton,
@@ -20,7 +21,6 @@ from jaxreg.local import (
     gyration_radius,
     turn_and_shift,
 )
-from jaxreg.local.steps.tiny_solve import solve_semidefinite
 from jaxreg.matching import (
     PlaneToPlane,
     PointToPlane,

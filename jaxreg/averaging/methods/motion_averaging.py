@@ -25,6 +25,7 @@ from jaxreg.averaging.steps.iterate import (
 from jaxreg.averaging.steps.rows import AbstractRows, EqualRows, RootRows
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import flow_solver
+from jaxreg.linear.small import after
 
 
 class MotionAveraging(AbstractAverager):
@@ -108,7 +109,8 @@ def iterate_plain(
 ) -> Iterated:
     """Averaging in which every edge is trusted; no gradients."""
     graph = jax.lax.stop_gradient(graph)
-    weight = rows.squared(graph, jnp.ones_like(graph.weight))
+    # The start may come from LAPACK, too.
+    weight = after(rows.squared(graph, jnp.ones_like(graph.weight)), T_start)
     solve = flow_solver(graph.edges, weight, graph.num_poses, STEP_TOLERANCE)
 
     return iterate(

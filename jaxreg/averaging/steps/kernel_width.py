@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from jaxreg.averaging.base import length_scale, nearest_rank, num_held
 from jaxreg.averaging.evidence import SCALES, redundancies
 from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.linear.small import inverse
 
 
 # The kernel is three standard deviations of the noise wide: right edges lose little
@@ -89,7 +90,7 @@ def _followed_width_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     settled = jnp.abs(target - width) < _SETTLED * width
     slope = jnp.where(settled[:, None], by_width(width), 0)
     change = jnp.where(settled, change, 0)
-    return width, jnp.linalg.solve(jnp.eye(2, dtype=slope.dtype) - slope, change)
+    return width, inverse(jnp.eye(2, dtype=slope.dtype) - slope) @ change
 
 
 def _three_deviations(

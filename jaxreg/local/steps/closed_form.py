@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Motion
 from jaxreg.geometry import lie
-from jaxreg.geometry.kabsch import nearest_rotation
+from jaxreg.geometry.nearest_rotation import nearest_rotation
 from jaxreg.local.steps.base import AbstractStep, full_matmul
 from jaxreg.matching.problem import Match
 from jaxreg.matching.residuals import AbstractResidual, Moments, PointToPoint

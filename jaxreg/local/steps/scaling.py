@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.local.steps.tiny_solve import solve_semidefinite
+from jaxreg.linear.small import eigh, solve_semidefinite
 from jaxreg.matching.problem import Match, sum_rows
 from jaxreg.matching.residuals.gram import half_sum
 
@@ -94,7 +94,7 @@ def condition(
     unit = jnp.where(jnp.arange(H.shape[0]) < d, 1, turn)
     scaled = H * unit[:, None] * unit
     finite = jnp.all(jnp.isfinite(scaled))
-    value = jnp.linalg.eigvalsh(jnp.where(finite, scaled, 0))
+    value = eigh(jnp.where(finite, scaled, 0))[0]
     good = finite & (value[-1] > 0)
     ratio = value[0] / jnp.where(good, value[-1], 1)
     return jnp.where(good, jnp.clip(ratio, 0, 1), 0)

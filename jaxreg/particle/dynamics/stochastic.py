@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
+from jaxreg.linear.small import eigh
 from jaxreg.local import turn_and_shift
 from jaxreg.particle.dynamics.base import AbstractDynamics
 from jaxreg.particle.state import Particles
@@ -77,5 +78,5 @@ def _root_of_covariance(
     # Rows out of use have no weight, but may hold errors that are not finite.
     error = jnp.where((weight > 0)[:, None] & jnp.isfinite(error), error, 0)
     S = jnp.einsum("p,pi,pj->ij", weight, error, error)
-    value, vector = jnp.linalg.eigh(S)
+    value, vector = eigh(S)
     return vector * jnp.sqrt(jnp.maximum(value, 0))
