@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.loop import status_of
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, StatusArray
 from jaxreg.averaging.trace import AveragingTrace
@@ -155,7 +156,7 @@ def solution(
         T_world_i=T_world_i,
         edge_weight=trust,
         agreement=weighted_mean((trust > 0.5).astype(dtype), graph.weight),
-        status=jnp.where(done, Status.CONVERGED, Status.MAX_STEPS).astype(jnp.int32),
+        status=status_of(done),
         placed=jnp.ones(T_world_i.shape[:1], dtype=bool),
         component=jnp.zeros(T_world_i.shape[:1], dtype=jnp.int32),
         kernel_width=width,

@@ -13,9 +13,9 @@ three found the best one more often than the others in all cases.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.loop import AbstractIteration
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import PointCloud
 from jaxreg.correlation.quadratic import Quadratic
@@ -31,21 +31,16 @@ _FREE = 1e-3
 
 
 class Ascent(eqx.Module):
-    """Where the steps ended.
+    """Where an ascent stands.
 
     Attributes:
-        T_target_source: the best pose.
+        T: the best pose so far.
+        model: the correlation about it.
+        trial: the pose that is looked at next.
+        damping: of the next step.
         num_steps: passes over the pairs.
-        moving: whether the steps ran out.
+        moving: False once a step was small.
     """
-
-    T_target_source: Float[Array, "D D"]
-    num_steps: Int[Array, ""]
-    moving: Bool[Array, ""]
-
-
-class _State(eqx.Module):
-    """`model` belongs to `T`, the best pose so far; `trial` is looked at next."""
 
     T: Float[Array, "D D"]
     model: Quadratic
@@ -55,23 +50,38 @@ class _State(eqx.Module):
     moving: Bool[Array, ""]
 
 
-def ascend(
-    source: PointCloud,
-    target: PointCloud,
-    init: Motion,
-    bandwidth: Scalar,
-    max_steps: int,
-    tolerance: Scalar,
-) -> Ascent:
+class Ascending(AbstractIteration[Motion, Ascent]):
     """Steps until one is smaller than `tolerance`; the correlation never falls.
 
     Gradients: none; see `newton_step`.
     """
 
-    def body(state: _State) -> _State:
-        model = Quadratic.at(state.trial, source, target, bandwidth)
+    source: PointCloud
+    target: PointCloud
+    bandwidth: Scalar
+    tolerance: Scalar
+
+    def init(self, start: Motion) -> Ascent:
+        """Nothing looked at yet."""
+        shapes = jax.eval_shape(lambda: self._model(start))
+        return Ascent(
+            T=start,
+            model=jax.tree.map(lambda x: jnp.full(x.shape, -1, x.dtype), shapes),
+            trial=start,
+            damping=jnp.asarray(10 * _FIRST_DAMPING, start.dtype),
+            num_steps=jnp.zeros((), jnp.int32),
+            moving=jnp.asarray(True),
+        )
+
+    def terminate(self, state: Ascent) -> Bool[Array, ""]:
+        """Whether the last step was small."""
+        return ~state.moving
+
+    def step(self, state: Ascent) -> Ascent:
+        """Looks at the trial, keeps the better pose, and tries the next."""
+        model = self._model(state.trial)
         # Equal up to the rounding of a sum counts as better.
-        slack = 16 * jnp.finfo(init.dtype).eps
+        slack = 16 * jnp.finfo(state.T.dtype).eps
         better = model.correlation >= (1 - slack) * state.model.correlation
         T, model = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
@@ -81,26 +91,17 @@ def ascend(
         damping = jnp.where(better, state.damping / 10, 10 * state.damping)
         damping = jnp.maximum(damping, _LEAST_DAMPING)
         tangent = _damped_step(model, damping)
-        return _State(
+        return Ascent(
             T=T,
             model=model,
             trial=lie.orthonormalise(turn_and_shift(T, tangent)),
             damping=damping,
             num_steps=state.num_steps + 1,
-            moving=jnp.max(jnp.abs(tangent)) > tolerance,
+            moving=jnp.max(jnp.abs(tangent)) > self.tolerance,
         )
 
-    shapes = jax.eval_shape(lambda: Quadratic.at(init, source, target, bandwidth))
-    start = _State(
-        T=init,
-        model=jax.tree.map(lambda x: jnp.full(x.shape, -1, x.dtype), shapes),
-        trial=init,
-        damping=jnp.asarray(10 * _FIRST_DAMPING, init.dtype),
-        num_steps=jnp.zeros((), jnp.int32),
-        moving=jnp.asarray(True),
-    )
-    end = lax.while_loop(lambda s: s.moving & (s.num_steps < max_steps), body, start)
-    return Ascent(end.T, end.num_steps, end.moving)
+    def _model(self, T: Motion) -> Quadratic:
+        return Quadratic.at(T, self.source, self.target, self.bandwidth)
 
 
 def newton_step(model: Quadratic, b: Float[Array, " k"]) -> Float[Array, " k"]:

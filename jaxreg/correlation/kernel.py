@@ -9,10 +9,11 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import cast_floats, traced
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.loop import iterate
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import PointCloud, median_spacing, thin, without_noise
-from jaxreg.correlation.ascent import ascend, is_free, newton_step
+from jaxreg.correlation.ascent import Ascending, is_free, newton_step
 from jaxreg.correlation.quadratic import Quadratic, pull_on_target
 from jaxreg.geometry import lie
 from jaxreg.local import sandwich, turn_and_shift
@@ -125,22 +126,23 @@ class KernelCorrelation(AbstractRegistrar):
         )
         width = self.width(spacing)
         fixed = lax.stop_gradient((source, target, init, width, self.tolerance))
-        end = ascend(*fixed[:4], self.max_steps, jnp.asarray(fixed[4]))
+        ascending = Ascending(*fixed[:2], fixed[3], jnp.asarray(fixed[4]))
+        ended = iterate(ascending, ascending.init(fixed[2]), max_steps=self.max_steps)
+        end = ended.state
 
-        model = Quadratic.at(end.T_target_source, source, target, width)
+        model = Quadratic.at(end.T, source, target, width)
         held = lax.stop_gradient(model)
-        T = turn_and_shift(end.T_target_source, newton_step(held, model.b))
-        T = jnp.where(end.moving, end.T_target_source, T)
+        T = turn_and_shift(end.T, newton_step(held, model.b))
+        T = jnp.where(ended.converged, T, end.T)
 
         there, back = _scores(fixed[0], fixed[1], lax.stop_gradient(T), spacing)
-        status = jnp.where(end.moving, Status.MAX_STEPS, Status.CONVERGED)
-        status = jnp.where(is_free(held), Status.DEGENERATE, status)
+        status = jnp.where(is_free(held), Status.DEGENERATE, ended.status)
         status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
         status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
         num_pairs = jnp.sum(source.mask, dtype=dtype) * jnp.sum(
             target.mask, dtype=dtype
         )
-        covariance = _covariance(held, end.T_target_source, *fixed[:2], fixed[3])
+        covariance = _covariance(held, end.T, *fixed[:2], fixed[3])
         overlap, rmse = mutual_overlap(there, back), there.inlier_rmse
         return RegistrationSolution(
             T_target_source=T,

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.adjoint import AbstractAdjoint
+from jaxreg._core.loop import AbstractIteration
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
 from jaxreg.geometry.nearest_rotation import nearest_rotation
@@ -85,28 +85,44 @@ class Limits(eqx.Module):
         )
 
 
-def descend(
-    optimiser: LocalOptimiser,
-    problem: Problem,
-    init: Motion,
-    scale: Scalar,
-    limits: Limits,
-    adjoint: AbstractAdjoint,
-) -> Descent:
-    """Descends from a pose and a scale; `adjoint` is that of the loop."""
-    n = problem.source.shape[1]
-    step = limits.stride(n)
-    coarse = problem.every(step).padded(n)
+class Descending(AbstractIteration[tuple[Motion, Scalar], Descent]):
+    """The steps of a descent, from a pose and a scale.
 
-    def body(state: Descent) -> Descent:
-        part, num = problem, None
-        if step > 1:
-            part = _either(state.fine, problem, coarse)
-            num = jnp.where(state.fine, n, -(-n // step))
-        if limits.with_scale:
-            part = part.scaled(state.scale)
-        found = match(part, state.T, num=num, coarse=~state.fine)
-        found = limits.within_reach(found)
+    Attributes:
+        optimiser: residual x kernel x step.
+        problem: the pair.
+        limits: when it ends.
+    """
+
+    optimiser: LocalOptimiser
+    problem: Problem
+    limits: Limits
+
+    def init(self, start: tuple[Motion, Scalar]) -> Descent:
+        """Nothing matched yet."""
+        T, scale = start
+        n = self.problem.source.shape[1]
+        return Descent(
+            T=T,
+            scale=scale,
+            T_matched=T,
+            scale_matched=scale,
+            row=jnp.zeros(n, jnp.int32),
+            first_sq_residual=jnp.zeros(n, T.dtype),
+            width=jnp.asarray(jnp.inf, T.dtype),
+            num_steps=jnp.zeros((), jnp.int32),
+            moving=jnp.asarray(True),
+            fine=jnp.asarray(self.limits.stride(n) == 1),
+        )
+
+    def terminate(self, state: Descent) -> Bool[Array, ""]:
+        """Whether the last step was small, of all points and at the final width."""
+        return ~state.moving
+
+    def step(self, state: Descent) -> Descent:
+        """Matches, weighs, moves."""
+        optimiser, limits = self.optimiser, self.limits
+        found = limits.within_reach(self._matched(state))
         width = optimiser.kernel.width_of(found.sq_residual, found.mask)
         width = jnp.maximum(jnp.minimum(width, state.width), limits.floor)
         weight = optimiser.weights(found, width)
@@ -136,27 +152,17 @@ def descend(
             | (state.num_steps + 2 >= limits.max_steps),
         )
 
-    return adjoint.while_loop(
-        lambda s: s.moving & (s.num_steps < limits.max_steps),
-        body,
-        _before(init, scale, n, fine=step == 1),
-        limits.max_steps,
-    )
-
-
-def _before(init: Motion, scale: Scalar, n: int, *, fine: bool) -> Descent:
-    return Descent(
-        T=init,
-        scale=scale,
-        T_matched=init,
-        scale_matched=scale,
-        row=jnp.zeros(n, jnp.int32),
-        first_sq_residual=jnp.zeros(n, init.dtype),
-        width=jnp.asarray(jnp.inf, init.dtype),
-        num_steps=jnp.zeros((), jnp.int32),
-        moving=jnp.asarray(True),
-        fine=jnp.asarray(fine),
-    )
+    def _matched(self, state: Descent) -> Match:
+        """All points or, while steps are large, every so-many-th."""
+        n = self.problem.source.shape[1]
+        stride = self.limits.stride(n)
+        part, num = self.problem, None
+        if stride > 1:
+            part = _either(state.fine, part, part.every(stride).padded(n))
+            num = jnp.where(state.fine, n, -(-n // stride))
+        if self.limits.with_scale:
+            part = part.scaled(state.scale)
+        return match(part, state.T, num=num, coarse=~state.fine)
 
 
 def _either(fine: Array, problem: Problem, coarse: Problem) -> Problem:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.adjoint import AbstractAdjoint, ImplicitAdjoint
 from jaxreg._core.arrays import cast_floats, spread_rows, traced
+from jaxreg._core.loop import iterate
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import (
@@ -24,7 +25,7 @@ from jaxreg.cloud import (
 )
 from jaxreg.geometry import lie
 from jaxreg.local.curvature import Curvature, is_degenerate
-from jaxreg.local.descent import Descent, Limits, descend
+from jaxreg.local.descent import Descending, Descent, Limits
 from jaxreg.local.implicit import stationary
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.steps import AbstractStep, GaussNewton
@@ -127,11 +128,20 @@ class ICP(AbstractRegistrar):
         problem = Problem.of(source, target, self._indexed(target, spacing))
         limits = self._limits(spacing)
         optimiser = self._optimiser
-        begin = self.adjoint.inputs((optimiser, problem, init, start_scale, limits))
-        end = descend(*begin, self.adjoint)
-        init, start_scale = begin[2:4]
+        descending = Descending(optimiser, problem, limits)
+        descending, (init, start_scale) = self.adjoint.inputs(
+            (descending, (init, start_scale))
+        )
+        ended = iterate(
+            descending,
+            descending.init((init, start_scale)),
+            max_steps=self.max_steps,
+            adjoint=self.adjoint,
+        )
+        end = ended.state
         T, scale = end.T, end.scale
-        width = jnp.where(end.width == begin[4].floor, limits.floor, end.width)
+        held = descending.limits.floor
+        width = jnp.where(end.width == held, limits.floor, end.width)
         if isinstance(self.adjoint, ImplicitAdjoint):
             T, scale = stationary(optimiser, problem, width, limits, end)
 
@@ -152,7 +162,7 @@ class ICP(AbstractRegistrar):
         )
         free = is_degenerate(self.residual, frozen_found, weight)
         T = lie.compose(scale * lie.rotation(T), lie.translation(T))
-        status = _status(T, end.moving, free, there, worse)
+        status = _status(T, ended.status, free, there, worse)
         curvature = Curvature.of(
             optimiser, problem.scaled(scale), end.T_matched, found, end.width
         )
@@ -251,13 +261,12 @@ class ICP(AbstractRegistrar):
 
 def _status(
     T: Motion,
-    moving: Bool[Array, ""],
+    status: Int[Array, ""],
     free: Bool[Array, ""],
     there: Score,
     worse: Bool[Array, ""],
 ) -> Int[Array, ""]:
-    """Of the answer `T`, the most serious last."""
-    status = jnp.where(moving, Status.MAX_STEPS, Status.CONVERGED)
+    """Of the answer `T`, from that of the loop; the most serious last."""
     status = jnp.where(free, Status.DEGENERATE, status)
     status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
     status = jnp.where(worse, Status.DIVERGED, status)

@@ -20,17 +20,17 @@ from jaxreg.averaging.base import (
     weighted_mean,
 )
 from jaxreg.averaging.evidence import redundancies, redundancy
-from jaxreg.averaging.methods.pose_graph_lm import (
+from jaxreg.averaging.steps.edge_errors import LogError
+from jaxreg.averaging.steps.gauss_newton import gauss_newton_gradients, precisions
+from jaxreg.averaging.steps.iterate import Iterated, pose_change
+from jaxreg.averaging.steps.kernel_width import CHI2_MEDIAN
+from jaxreg.averaging.steps.levenberg_marquardt import (
     Minimum,
     Problem,
     minimise,
     no_cycle,
     robust_problem,
 )
-from jaxreg.averaging.steps.edge_errors import LogError
-from jaxreg.averaging.steps.gauss_newton import gauss_newton_gradients, precisions
-from jaxreg.averaging.steps.iterate import Iterated, pose_change
-from jaxreg.averaging.steps.kernel_width import CHI2_MEDIAN
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph

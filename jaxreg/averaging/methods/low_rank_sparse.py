@@ -12,10 +12,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
-from jaxreg._core.typing import Key
+from jaxreg._core.loop import AbstractIteration, iterate
+from jaxreg._core.typing import Key, Scalar
 from jaxreg.averaging.base import (
     AbstractAverager,
     AveragingSolution,
@@ -71,52 +72,64 @@ class LowRankSparse(AbstractAverager):
         scale = length_scale(graph)
         X, seen = _blocks(graph, scale)
         limit = jnp.maximum(self.tolerance, 8 * jnp.finfo(X.dtype).eps)
-
-        def unfinished(s: _State) -> Array:
-            return (s.change > limit) & (s.step < self.max_steps)
-
+        splitting = _Splitting(X, seen, jnp.asarray(self.threshold), limit)
         eye = jnp.tile(jnp.eye(D, dtype=X.dtype), (num, 1))
-        start = _State(
-            basis=eye,
-            L=jnp.zeros((num * D, num * D), X.dtype),
-            change=jnp.asarray(jnp.inf, X.dtype),
-            step=jnp.asarray(0, jnp.int32),
-        )
-        end = jax.lax.while_loop(
-            unfinished, lambda s: _turn(X, seen, jnp.asarray(self.threshold), s), start
-        )
+        ended = iterate(splitting, splitting.init(eye), max_steps=self.max_steps)
+        end = ended.state
         distance = _block_norms(X - end.L, num)[graph.edges[:, 0], graph.edges[:, 1]]
         return solution(
             graph,
             _poses(end.L, num, scale),
             edge_weight=self.threshold / jnp.maximum(distance, self.threshold),
-            converged=end.change <= limit,
-            num_steps=end.step,
+            converged=ended.converged,
+            num_steps=end.num_steps,
         )
 
 
 class _State(NamedTuple):
-    basis: Array  # (v D, D) spans the columns of L
-    L: Array
-    change: Array
-    step: Array
+    basis: Float[Array, "n D"]  # spans the columns of L
+    L: Float[Array, "n n"]
+    change: Float[Array, ""]
+    num_steps: Int[Array, ""]
 
 
-def _turn(X: Array, seen: Array, threshold: Array, s: _State) -> _State:
-    """S1 and S2 for the present L, then L by one step of subspace iteration."""
-    num = seen.shape[0]
-    D = X.shape[0] // num
-    gap = X - s.L
-    norm = _block_norms(gap, num)
-    kept = jnp.minimum(threshold / jnp.where(norm > 0, norm, 1), 1)
-    # X - S1 - S2 is L plus the share of the gap that is not split off.
-    share = jnp.repeat(jnp.repeat(jnp.where(seen, kept, 0), D, 0), D, 1)
-    rest = s.L + share * gap
-    basis = jnp.linalg.qr(rest @ (rest.T @ s.basis))[0]
-    L = basis @ (basis.T @ rest)
-    size = jnp.sqrt(jnp.sum(L**2))
-    change = jnp.sqrt(jnp.sum((L - s.L) ** 2)) / jnp.where(size > 0, size, 1)
-    return _State(basis, L, change, s.step + 1)
+class _Splitting(AbstractIteration[Array, _State]):
+    """S1, S2 and L in turns, from a basis of the columns of L."""
+
+    X: Float[Array, "n n"]
+    seen: Bool[Array, "v v"]
+    threshold: Scalar
+    limit: Scalar
+
+    def init(self, start: Array) -> _State:
+        return _State(
+            basis=start,
+            L=jnp.zeros_like(self.X),
+            change=jnp.asarray(jnp.inf, start.dtype),
+            num_steps=jnp.asarray(0, jnp.int32),
+        )
+
+    def terminate(self, state: _State) -> Bool[Array, ""]:
+        return state.change <= self.limit
+
+    def fail(self, state: _State) -> Bool[Array, ""]:
+        return jnp.isnan(state.change)
+
+    def step(self, state: _State) -> _State:
+        """S1 and S2 for the present L, then L by one step of subspace iteration."""
+        num = self.seen.shape[0]
+        D = self.X.shape[0] // num
+        gap = self.X - state.L
+        norm = _block_norms(gap, num)
+        kept = jnp.minimum(self.threshold / jnp.where(norm > 0, norm, 1), 1)
+        # X - S1 - S2 is L plus the share of the gap that is not split off.
+        share = jnp.repeat(jnp.repeat(jnp.where(self.seen, kept, 0), D, 0), D, 1)
+        rest = state.L + share * gap
+        basis = jnp.linalg.qr(rest @ (rest.T @ state.basis))[0]
+        L = basis @ (basis.T @ rest)
+        size = jnp.sqrt(jnp.sum(L**2))
+        change = jnp.sqrt(jnp.sum((L - state.L) ** 2)) / jnp.where(size > 0, size, 1)
+        return _State(basis, L, change, state.num_steps + 1)
 
 
 def _block_norms(A: Array, num: int) -> Float[Array, "v v"]:

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import loop
+from jaxreg._core.typing import Scalar
 from jaxreg.averaging.base import (
     AveragingSolution,
     length_scale,
@@ -59,14 +61,6 @@ def solution_of(graph: PoseGraph, end: Iterated) -> AveragingSolution:
         num_steps=end.num_steps,
         trace=end.trace,
     )
-
-
-class _State(NamedTuple):
-    T: Array
-    width: Array
-    change: Array
-    step: Array
-    rows: Array  # of the trace
 
 
 def nearby_rotation(T: Float[Array, "*b D D"]) -> Float[Array, "*b D D"]:
@@ -154,34 +148,64 @@ def iterate(
     graph, T_start, width_start, tolerance = jax.lax.stop_gradient(
         (graph, T_start, width_start, tolerance)
     )
-    scale = length_scale(graph)
     limit = jnp.maximum(tolerance, 32 * jnp.finfo(T_start.dtype).eps)
-
-    def unfinished(s: _State) -> Array:
-        return (s.change > limit) & (s.step < max_steps)
-
-    def step(s: _State) -> _State:
-        width = width_of(graph, s.T, s.width)
-        trust = trust_of(graph, s.T, width)
-        T = step_of(graph, s.T, trust, width)
-        moved = pose_change(s.T, T, scale)
-        trusted = weighted_mean(trust, graph.weight)
-        rows = with_row(s.rows, s.step, moved, width, trusted)
-        shrinking = jnp.any(width < 0.999 * s.width) & jnp.all(jnp.isfinite(s.width))
-        change = moved + jnp.where(shrinking, limit, 0)
-        return _State(T, width, change, s.step + 1, rows)
-
-    start = _State(
-        T=T_start,
-        width=width_start,
-        change=jnp.asarray(jnp.inf, T_start.dtype),
-        step=jnp.asarray(0, jnp.int32),
-        rows=no_rows(max_steps, T_start.dtype),
+    averaging = _Averaging(
+        graph, length_scale(graph), limit, width_of, trust_of, step_of, max_steps
     )
-    end = jax.lax.while_loop(unfinished, step, start)
+    begin = averaging.init((T_start, width_start))
+    ended = loop.iterate(averaging, begin, max_steps=max_steps)
+    end = ended.state
     trust = trust_of(graph, end.T, end.width)
-    trace = AveragingTrace.of(end.rows, end.step)
-    return Iterated(end.T, trust, end.width, end.change <= limit, end.step, trace)
+    trace = AveragingTrace.of(end.rows, end.num_steps)
+    return Iterated(end.T, trust, end.width, ended.converged, end.num_steps, trace)
+
+
+class _State(NamedTuple):
+    T: Float[Array, "v D D"]
+    width: Float[Array, "2"]
+    change: Float[Array, ""]
+    num_steps: Int[Array, ""]
+    rows: Float[Array, "s 4"]  # of the trace
+
+
+class _Averaging(loop.AbstractIteration[tuple[Array, Array], _State]):
+    """Weights and steps in turns, from poses and kernel widths."""
+
+    graph: PoseGraph
+    scale: Scalar
+    limit: Scalar
+    width_of: WidthOf
+    trust_of: TrustOf
+    step_of: Step
+    max_steps: int
+
+    def init(self, start: tuple[Array, Array]) -> _State:
+        T, width = start
+        return _State(
+            T=T,
+            width=width,
+            change=jnp.asarray(jnp.inf, T.dtype),
+            num_steps=jnp.asarray(0, jnp.int32),
+            rows=no_rows(self.max_steps, T.dtype),
+        )
+
+    def terminate(self, state: _State) -> Bool[Array, ""]:
+        return state.change <= self.limit
+
+    def fail(self, state: _State) -> Bool[Array, ""]:
+        return jnp.isnan(state.change)
+
+    def step(self, state: _State) -> _State:
+        graph, before = self.graph, state.width
+        width = self.width_of(graph, state.T, before)
+        trust = self.trust_of(graph, state.T, width)
+        T = self.step_of(graph, state.T, trust, width)
+        moved = pose_change(state.T, T, self.scale)
+        trusted = weighted_mean(trust, graph.weight)
+        rows = with_row(state.rows, state.num_steps, moved, width, trusted)
+        shrinking = jnp.any(width < 0.999 * before) & jnp.all(jnp.isfinite(before))
+        change = moved + jnp.where(shrinking, self.limit, 0)
+        return _State(T, width, change, state.num_steps + 1, rows)
 
 
 def pose_change(T_old: Array, T_new: Array, scale: Array) -> Array:
