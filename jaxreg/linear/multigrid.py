@@ -1,8 +1,6 @@
 """An approximate inverse of graph Laplacians with k x k weights: a multigrid cycle.
 
-The Laplacian of weights W_e is the matrix of sum_e (x_j - x_i)' W_e (x_j - x_i): scalar
-weights in motion averaging, 6 x 6 ones in Gauss-Newton steps with left tangents. On
-both, motions that all frames share cost nothing, so frames that are held together
+Motions that all frames share cost nothing, so frames that are held together
 strongly move as one on the next level, whose matrix is again a graph Laplacian, and
 the last, of some tens of frames, is inverted. Frames are paired by the strength of
 their edges, not by their number: bending a long chain costs little beside stretching
@@ -18,10 +16,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxreg.linear.aggregation import RATIO, aggregate
 from jaxreg.linear.krylov import conjugate_gradients
+from jaxreg.linear.operator import GraphLaplacian, matmul
 from jaxreg.linear.small import inverse_semidefinite
 
 
@@ -31,27 +30,8 @@ _EXACT, _INNER = 384, 2
 _DAMPED = 0.75
 
 
-class Laplacian(NamedTuple):
-    """sum_e (x_j - x_i)' W_e (x_j - x_i) + sum_i x_i' own_i x_i, as a matrix."""
-
-    edges: Int[Array, "e 2"]
-    weight: Float[Array, "e k k"]
-    own: Float[Array, "v k k"]
-
-    def __call__(self, x: Float[Array, "v k c"]) -> Float[Array, "v k c"]:
-        """The product with c columns."""
-        i, j = self.edges[:, 0], self.edges[:, 1]
-        flow = matmul(self.weight, x[j] - x[i])
-        return matmul(self.own, x).at[j].add(flow).at[i].add(-flow)
-
-    def diagonal(self) -> Float[Array, "v k k"]:
-        """Its diagonal blocks."""
-        i, j = self.edges[:, 0], self.edges[:, 1]
-        return self.own.at[i].add(self.weight).at[j].add(self.weight)
-
-
 class _Level(NamedTuple):
-    matrix: Laplacian
+    matrix: GraphLaplacian
     jacobi: Array  # (v, k, k) the damped Jacobi step; 0 for frames that nothing holds
     parent: Array  # (v,) frames of the next level
     held: Array  # (v,) 1, or 0 for frames that nothing holds
@@ -73,9 +53,9 @@ class Multigrid(NamedTuple):
         level = self.levels[number]
         held = level.held[:, None, None]
         x = matmul(level.jacobi, r)
-        left = held * (r - level.matrix(x))
+        left = held * (r - level.matrix.mv(x))
         x = x + held * self._below(number + 1, level.parent, left)[level.parent]
-        return x + matmul(level.jacobi, r - level.matrix(x))
+        return x + matmul(level.jacobi, r - level.matrix.mv(x))
 
     def _below(self, number: int, parent: Array, r: Array) -> Array:
         """The solution on the next level."""
@@ -86,7 +66,7 @@ class Multigrid(NamedTuple):
         if last:
             return self._cycle(number, total)
         return conjugate_gradients(
-            self.levels[number].matrix,
+            self.levels[number].matrix.mv,
             lambda r: self._cycle(number, r),
             total,
             tolerance=0,
@@ -94,44 +74,22 @@ class Multigrid(NamedTuple):
         )[0]
 
 
-def anchored(
-    edges: Int[Array, "e 2"],
-    weight: Float[Array, "e k k"],
-    num_poses: int,
-    damping: Float[Array, ""] | float = 0.0,
-) -> Laplacian:
-    """The Laplacian plus `damping` times its diagonal, with frame 0 tied to the ground.
-
-    Without damping, and for right-hand sides that sum to 0, the tie bears nothing:
-    solutions are those with x_0 = 0.
-    """
-    none = jnp.zeros((num_poses, *weight.shape[1:]), weight.dtype)
-    diagonal = Laplacian(edges, weight, none).diagonal()
-    return Laplacian(edges, weight, (damping * diagonal).at[0].add(diagonal[0]))
-
-
-def multigrid(matrix: Laplacian) -> Multigrid:
+def multigrid(matrix: GraphLaplacian) -> Multigrid:
     """The approximate inverse of a matrix of positive semidefinite weights."""
     levels = []
     k = matrix.own.shape[-1]
     while matrix.own.shape[0] * k > _EXACT:
         level, matrix = _coarser(matrix)
         levels.append(level)
-    num = matrix.own.shape[0]
-    i, j = matrix.edges[:, 0], matrix.edges[:, 1]
-    frame = jnp.arange(num)
-    full = jnp.zeros((num, num, k, k), matrix.own.dtype)
-    full = full.at[frame, frame].add(matrix.diagonal())
-    full = full.at[i, j].add(-matrix.weight).at[j, i].add(-matrix.weight)
-    full = full.transpose(0, 2, 1, 3).reshape(num * k, num * k)
-    return Multigrid(tuple(levels), ridged_inverse(full))
+    return Multigrid(tuple(levels), ridged_inverse(matrix.dense()))
 
 
-def _coarser(matrix: Laplacian) -> tuple[_Level, Laplacian]:
+def _coarser(matrix: GraphLaplacian) -> tuple[_Level, GraphLaplacian]:
     """A level and the matrix of the next."""
-    (edges, weight, own), k = matrix, matrix.own.shape[-1]
+    edges, weight, own = matrix.edges, matrix.weight, matrix.own
+    k = own.shape[-1]
     i, j = edges[:, 0], edges[:, 1]
-    diagonal = matrix.diagonal()
+    diagonal = matrix.blocks()
     held = jnp.trace(diagonal, axis1=-2, axis2=-1) > 0
     inverse = _block_inverses(diagonal)
     # The share of each edge in what holds its frames, whatever the coordinates.
@@ -153,7 +111,7 @@ def _coarser(matrix: Laplacian) -> tuple[_Level, Laplacian]:
         lambda: own,
     )
     level = _Level(matrix, _DAMPED * inverse, agg.parent, held.astype(own.dtype))
-    return level, Laplacian(agg.edges, blocks, own)
+    return level, GraphLaplacian(agg.edges, blocks, own)
 
 
 def _block_inverses(A: Float[Array, "v k k"]) -> Float[Array, "v k k"]:
@@ -163,11 +121,6 @@ def _block_inverses(A: Float[Array, "v k k"]) -> Float[Array, "v k k"]:
     root = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
     both = root[:, :, None] * root[:, None, :]
     return inverse_semidefinite(A * both) * both
-
-
-def matmul(A: Float[Array, "v a b"], x: Float[Array, "v b c"]) -> Float[Array, "v a c"]:
-    """A @ x, quicker on CPU than `@` or a broadcast sum for blocks of six."""
-    return jnp.einsum("vab,vbc->vac", A, x)
 
 
 def ridged_inverse(A: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:

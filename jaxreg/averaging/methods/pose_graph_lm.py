@@ -25,8 +25,8 @@ from jaxreg.averaging.steps.levenberg_marquardt import (
     robust_problem,
 )
 from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.linear.laplacian import divergence
-from jaxreg.linear.multigrid import anchored, multigrid
+from jaxreg.linear.multigrid import multigrid
+from jaxreg.linear.operator import GraphLaplacian, divergence
 from jaxreg.robust import AbstractKernel
 
 
@@ -113,5 +113,6 @@ def _nearly_balanced(edges: Array, Q: Array, rows: Array) -> Array:
     """Tangents that about undo an imbalance."""
     # What arrives at pose 0 leaves the others.
     rows = rows.at[0].set(-jnp.sum(rows[1:], axis=0))
-    x = multigrid(anchored(edges, Q, len(rows)))(-rows[..., None])[..., 0]
+    inverse = multigrid(GraphLaplacian.anchored(edges, Q, len(rows)))
+    x = inverse(-rows[..., None])[..., 0]
     return x - x[0]

@@ -11,7 +11,8 @@ from jaxreg.averaging.steps.kernel_width import gaussian_trust
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 from jaxreg.graph.trees import ancestors
-from jaxreg.linear.laplacian import divergence, laplacian
+from jaxreg.linear.laplacian import laplacian
+from jaxreg.linear.operator import divergence
 
 
 # Motions tried for each group.

@@ -21,7 +21,8 @@ from jaxreg.averaging.steps.rows import AbstractRows
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
-from jaxreg.linear.laplacian import divergence, solve_flow
+from jaxreg.linear.laplacian import solve_flow
+from jaxreg.linear.operator import divergence
 
 
 #: Relative tolerance of a step's system: each step takes up what the last one left.

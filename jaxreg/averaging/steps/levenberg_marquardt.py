@@ -25,8 +25,9 @@ from jaxreg.averaging.steps.iterate import nearby_rotation, pose_change
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
-from jaxreg.linear.block_system import solve_block_flow
-from jaxreg.linear.multigrid import Multigrid, anchored, matmul, multigrid
+from jaxreg.linear.multigrid import Multigrid, multigrid
+from jaxreg.linear.operator import GraphLaplacian, divergence, matmul
+from jaxreg.linear.solvers import MultigridCG
 from jaxreg.robust import AbstractKernel
 
 
@@ -34,6 +35,8 @@ from jaxreg.robust import AbstractKernel
 # a pose has moved by this share of the length of an edge: how turns of one end shift
 # the other depends on where they are, and on it how stiff bends of long chains are.
 _STALE, _MOVED = 2, 0.3
+# Of the system of a step: the next step takes up what is left.
+_SYSTEM_TOLERANCE = 1e-2
 # Share of a step's gain that conjugate gradients may leave to the next.
 _UNDONE = 0.1
 # Damping after the first refused step, and the least. There is none before: even 1e-9
@@ -118,7 +121,9 @@ def no_cycle(problem: Problem, T: Float[Array, "v D D"]) -> Cycle:
     """One to be built."""
     graph = problem.graph
     shapes = jax.eval_shape(
-        lambda: multigrid(anchored(graph.edges, problem.normal(T)[0], graph.num_poses))
+        lambda: multigrid(
+            GraphLaplacian.anchored(graph.edges, problem.normal(T)[0], graph.num_poses)
+        )
     )
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     return Cycle(blank, jnp.asarray(0, jnp.int32), jnp.zeros((), T.dtype))
@@ -192,10 +197,10 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         s, problem = state, self.problem
         Q, force = problem.normal(s.T)
         graph = problem.graph
-        matrix = anchored(graph.edges, Q, graph.num_poses, s.damping)
+        matrix = GraphLaplacian.anchored(graph.edges, Q, graph.num_poses, s.damping)
         kept = (s.cycle.usual > 0) & (s.cycle.moved < _MOVED * self.length)
         inverse = jax.lax.cond(kept, lambda: s.cycle.inverse, lambda: multigrid(matrix))
-        x, rounds = solve_block_flow(matrix, force, inverse, tolerance=1e-2)
+        x, rounds = _tangents(matrix, force, inverse)
         T = nearby_rotation(product(lie.exp(x), s.T))
         cost = problem.cost(T)
         better = cost <= s.cost
@@ -232,3 +237,20 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
 
 def _predicted(graph: PoseGraph, T: Array) -> Array:
     return product(lie.inverse(T)[graph.edges[:, 0]], T[graph.edges[:, 1]])
+
+
+def _tangents(
+    matrix: GraphLaplacian, force: Array, inverse: Multigrid
+) -> tuple[Array, Array]:
+    """Left tangents x of the normal equations B' Q B x = -B' f, and the rounds.
+
+    Pose 0 and poses that no weight holds stay.
+    """
+    rhs = -divergence(matrix.edges, force, len(matrix.own))[..., None]
+    solver = MultigridCG(_SYSTEM_TOLERANCE, max_steps=300)
+    state = solver.init(matrix, {"preconditioner": inverse})
+    x, _, stats = solver.compute(state, rhs, {})
+    # Damping leaves pose 0 some of the motion that all share.
+    held = jnp.trace(matrix.blocks(), axis1=-2, axis2=-1) > 0
+    x = jnp.where(held[:, None], x[..., 0] - x[0, :, 0], 0)
+    return x, stats["num_steps"]

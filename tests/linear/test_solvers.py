@@ -1,0 +1,78 @@
+"""Solvers of graph Laplacians under lineax's own driver."""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+
+from jaxreg.linear.operator import GraphLaplacian
+from jaxreg.linear.solvers import LeastSquares, MultigridCG, RidgedCholesky
+
+
+NUM, K, COLUMNS = 150, 3, 2
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _in_float64() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def system() -> tuple[GraphLaplacian, np.ndarray]:
+    """A chain with closures and block weights, and right-hand sides it can meet."""
+    rng = np.random.default_rng(0)
+    chain = np.stack([np.arange(NUM - 1), np.arange(1, NUM)], axis=1)
+    loops = np.sort(rng.integers(0, NUM, (80, 2)), axis=1)
+    edges = np.concatenate([chain, loops[loops[:, 0] != loops[:, 1]]])
+    root = rng.normal(size=(len(edges), K, K + 2))
+    weight = root @ root.swapaxes(1, 2)
+    operator = GraphLaplacian.anchored(
+        jnp.asarray(edges, jnp.int32), jnp.asarray(weight), NUM, columns=COLUMNS
+    )
+    rhs = rng.normal(size=(NUM, K, COLUMNS))
+    return operator, rhs - rhs.mean(axis=0)
+
+
+def test_products_are_those_of_the_matrix(system):
+    operator, x = system
+    found = operator.mv(jnp.asarray(x)).reshape(-1)
+    np.testing.assert_allclose(found, operator.as_matrix() @ x.ravel(), atol=1e-9)
+    diagonal = lx.diagonal(operator)
+    np.testing.assert_allclose(diagonal, jnp.diagonal(operator.as_matrix()))
+    dense = np.asarray(operator.dense())
+    np.testing.assert_allclose(dense, dense.T, atol=1e-12)
+    # Motions that all frames share cost what ties frame 0, and nothing else.
+    shared = np.tile(np.eye(K), (NUM, 1))
+    np.testing.assert_allclose(dense[K:] @ shared, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("solver", "tol"),
+    [(LeastSquares(), 1e-9), (RidgedCholesky(), 1e-9), (MultigridCG(1e-12), 1e-7)],
+)
+def test_solves_under_the_driver_of_lineax(system, solver, tol):
+    operator, rhs = system
+    expected = np.linalg.solve(np.asarray(operator.dense()), rhs.reshape(NUM * K, -1))
+
+    @jax.jit
+    def solved(operator, rhs):
+        return lx.linear_solve(operator, rhs, solver).value
+
+    x = solved(operator, jnp.asarray(rhs))
+    np.testing.assert_allclose(x.reshape(NUM * K, -1), expected, atol=tol)
+    # lineax's derivative: d(x . y) / d rhs is the solution for y.
+    slope = jax.grad(lambda r: jnp.sum(solved(operator, r) * rhs))(jnp.asarray(rhs))
+    np.testing.assert_allclose(slope, x, atol=10 * tol)
+
+
+def test_steps_that_run_out_are_told(system):
+    operator, rhs = system
+    found = lx.linear_solve(
+        operator, jnp.asarray(rhs), MultigridCG(1e-12, max_steps=2), throw=False
+    )
+    assert found.result == lx.RESULTS.max_steps_reached
+    assert int(found.stats["num_steps"]) == 2
