@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import EdgeError, PoseGraph
+from jaxreg.graph.edge_checks import EdgeError
+from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxreg.graph.pose_graph import EdgeError, PoseGraph
+from jaxreg.graph.edge_checks import EdgeError
+from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 from jaxreg.io.rows import ids, numbers, read_lines
