@@ -52,6 +52,8 @@ Static and traced:
 
 from jaxreg import io as io
 from jaxreg import metrics as metrics
+from jaxreg import neighbours as neighbours
+from jaxreg import particle as particle
 from jaxreg import robust as robust
 from jaxreg._core.adjoint import ImplicitAdjoint as ImplicitAdjoint
 from jaxreg._core.adjoint import (
@@ -59,6 +61,7 @@ from jaxreg._core.adjoint import (
 )
 from jaxreg._core.status import Status as Status
 from jaxreg.averaging import MCC as MCC
+from jaxreg.averaging import AbstractAverager as AbstractAverager
 from jaxreg.averaging import AveragingSolution as AveragingSolution
 from jaxreg.averaging import AveragingTrace as AveragingTrace
 from jaxreg.averaging import ChordalError as ChordalError
@@ -77,10 +80,12 @@ from jaxreg.averaging import pose_covariances as pose_covariances
 from jaxreg.correlation import KernelCorrelation as KernelCorrelation
 from jaxreg.graph import PoseGraph as PoseGraph
 from jaxreg.local import ICP as ICP
+from jaxreg.local import AbstractStep as AbstractStep
 from jaxreg.local import ClosedForm as ClosedForm
 from jaxreg.local import GaussNewton as GaussNewton
 from jaxreg.local import GradientDescent as GradientDescent
 from jaxreg.local import LevenbergMarquardt as LevenbergMarquardt
+from jaxreg.matching import AbstractResidual as AbstractResidual
 from jaxreg.matching import PlaneToPlane as PlaneToPlane
 from jaxreg.matching import PointToPlane as PointToPlane
 from jaxreg.matching import PointToPoint as PointToPoint
@@ -88,17 +93,24 @@ from jaxreg.matching import Symmetric as Symmetric
 from jaxreg.multiview import ReconstructionSolution as ReconstructionSolution
 from jaxreg.multiview import RelativeMotions as RelativeMotions
 from jaxreg.multiview import reconstruct as reconstruct
+from jaxreg.neighbours import AbstractIndex as AbstractIndex
 from jaxreg.neighbours import BoxTree as BoxTree
 from jaxreg.neighbours import BruteForce as BruteForce
 from jaxreg.neighbours import CellGrid as CellGrid
 from jaxreg.neighbours import VoxelTable as VoxelTable
 from jaxreg.neighbours import correspondences as correspondences
+from jaxreg.particle import AbstractDynamics as AbstractDynamics
+from jaxreg.particle import AbstractEnergy as AbstractEnergy
+from jaxreg.particle import AbstractPrior as AbstractPrior
+from jaxreg.particle import AbstractResampler as AbstractResampler
 from jaxreg.particle import MultiStart as MultiStart
 from jaxreg.particle import ParticleFilter as ParticleFilter
 from jaxreg.particle import sandhu2010 as sandhu2010
+from jaxreg.registrar import AbstractRegistrar as AbstractRegistrar
 from jaxreg.registrar import RegistrationSolution as RegistrationSolution
 from jaxreg.registrar import SearchTrace as SearchTrace
 from jaxreg.registration import register as register
+from jaxreg.robust import AbstractKernel as AbstractKernel
 
 
 __version__ = "0.1.0"

@@ -46,14 +46,13 @@ class AbstractKernel(BriefModule):
     def weight(self, sq_residual: Values, width: Width) -> Values:
         """rho'(r) / r: the weight of the residual in a least-squares step."""
 
+    @abc.abstractmethod
     def width_of(
         self, sq_residual: Float[Array, " n"], mask: Bool[Array, " n"]
     ) -> Width:
         """The width that the data suggest, in the unit of the residual.
 
-        Three times the lower third of the norms: it follows the residuals of the
-        points that fit, as long as a third of the points do. (Of a Gaussian residual
-        in one dimension, the lower third is 0.43 standard deviations.)
+        Most kernels take `three_lower_thirds`.
 
         Args:
             sq_residual: `(n,)` squared residual norms.
@@ -64,7 +63,18 @@ class AbstractKernel(BriefModule):
 
         Gradients: none.
         """
-        return 3 * jnp.sqrt(masked_quantile(sq_residual, mask, 1 / 3))
+
+
+def three_lower_thirds(
+    self: AbstractKernel, sq_residual: Float[Array, " n"], mask: Bool[Array, " n"]
+) -> Width:
+    """Three times the lower third of the norms: a `width_of` for most kernels.
+
+    It follows the residuals of the points that fit, as long as a third of the points
+    do. (Of a Gaussian residual in one dimension, the lower third is 0.43 standard
+    deviations.)
+    """
+    return 3 * jnp.sqrt(masked_quantile(sq_residual, mask, 1 / 3))
 
 
 def _square(width: Width) -> Width:
@@ -80,6 +90,8 @@ class L2(AbstractKernel):
 
     Not redescending. The fastest and most accurate without outliers, ruined by one.
     """
+
+    width_of = three_lower_thirds
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """r^2 / 2."""
@@ -97,6 +109,8 @@ class L1(AbstractKernel):
     from the solution.
     """
 
+    width_of = three_lower_thirds
+
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """sqrt(r^2 + width^2) - width, written so that it does not cancel near zero."""
         scale = jnp.sqrt(_square(width))
@@ -113,6 +127,8 @@ class Huber(AbstractKernel):
     Convex and not redescending: least squares for the points that fit, and a bounded,
     but not vanishing, pull of the others. A safe choice far from the solution.
     """
+
+    width_of = three_lower_thirds
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """r^2 / 2, or width (r - width / 2) where r > width."""
@@ -135,6 +151,8 @@ class Cauchy(AbstractKernel):
     pull. Between Huber and GemanMcClure when the start is neither near nor far.
     """
 
+    width_of = three_lower_thirds
+
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """width^2 / 2 log(1 + r^2 / width^2)."""
         sq_width = _square(width)
@@ -153,6 +171,8 @@ class GemanMcClure(AbstractKernel):
     large.
     """
 
+    width_of = three_lower_thirds
+
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """r^2 / 2 / (1 + r^2 / width^2)."""
         sq_width = _square(width)
@@ -169,6 +189,8 @@ class Tukey(AbstractKernel):
     The biweight of Beaton and Tukey 1974. Redescending, and residuals beyond the width
     do not count at all: for the last steps, when outliers are well apart from the rest.
     """
+
+    width_of = three_lower_thirds
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """width^2 / 6 (1 - (1 - u)^3) with u = r^2 / width^2 clipped at one."""
@@ -188,6 +210,8 @@ class Welsch(AbstractKernel):
     Redescending and bounded by width^2. Its weights are Gaussian in the residual: the
     choice where the noise of the good residuals is Gaussian of that width.
     """
+
+    width_of = three_lower_thirds
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """width^2 (1 - exp(-r^2 / (2 width^2)))."""

@@ -11,7 +11,7 @@ from jaxreg._core.arrays import cast_floats, traced
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.loop import iterate
 from jaxreg._core.status import Status
-from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
+from jaxreg._core.typing import Key, Mask, Motion, Points
 from jaxreg.cloud import PointCloud, median_spacing, thin, without_noise
 from jaxreg.correlation.ascent import Ascending, is_free, newton_step
 from jaxreg.correlation.quadratic import Quadratic, pull_on_target
@@ -19,7 +19,7 @@ from jaxreg.geometry import lie
 from jaxreg.local import sandwich, turn_and_shift
 from jaxreg.matching import Score, mutual_overlap, score_both_ways
 from jaxreg.neighbours import exact_index
-from jaxreg.registrar import AbstractRegistrar, Modes, RegistrationSolution
+from jaxreg.registrar import AbstractRegistrar, Frames, Modes, RegistrationSolution
 
 
 # The bandwidth where none is given, in root mean square radii of the target and, where
@@ -97,11 +97,12 @@ class KernelCorrelation(AbstractRegistrar):
                 f"{self.bandwidth}."
             )
 
-    def in_unit(self, length: Scalar) -> "KernelCorrelation":
-        """With the bandwidth in `length`s."""
+    def in_frames(self, frames: Frames) -> "KernelCorrelation":
+        """With the bandwidth in radii."""
         if self.bandwidth is None:
             return self
-        bandwidth = jnp.asarray(self.bandwidth, length.dtype) / length
+        radius = frames.radius
+        bandwidth = jnp.asarray(self.bandwidth, radius.dtype) / radius
         return eqx.tree_at(lambda m: m.bandwidth, self, bandwidth)
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:

@@ -33,7 +33,12 @@ from jaxreg.matching.problem import Match, Problem, match
 from jaxreg.matching.residuals import AbstractResidual, PlaneToPlane
 from jaxreg.matching.score import Score, mutual_overlap, score, score_match
 from jaxreg.neighbours import AbstractIndex, BruteForce, index_within
-from jaxreg.registrar.base import AbstractRegistrar, Modes, RegistrationSolution
+from jaxreg.registrar import (
+    AbstractRegistrar,
+    Frames,
+    Modes,
+    RegistrationSolution,
+)
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
 
@@ -104,9 +109,10 @@ class ICP(AbstractRegistrar):
                     f"ICP: {name} must be at least 1, found {getattr(self, name)}."
                 )
 
-    def in_unit(self, length: Scalar) -> "ICP":
-        """With the correspondence distance in `length`s."""
-        limit = jnp.asarray(self.max_correspondence_distance, length.dtype) / length
+    def in_frames(self, frames: Frames) -> "ICP":
+        """With the correspondence distance in radii."""
+        radius = frames.radius
+        limit = jnp.asarray(self.max_correspondence_distance, radius.dtype) / radius
         return eqx.tree_at(lambda m: m.max_correspondence_distance, self, limit)
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:

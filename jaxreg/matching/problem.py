@@ -147,11 +147,7 @@ def match(
     rotated = rotate(R, problem.source)
     moved = rotated + t[:, None]
     if row is None:
-        row = (
-            problem.index.lookup(moved, num)
-            if coarse is None
-            else problem.index.lookup_staged(moved, coarse, num)
-        )
+        row = problem.index.lookup(moved, num, coarse)
     found = problem.target[row]
     normal = jnp.stack([found[:, d + k] for k in range(d)])
     residual = jnp.stack([found[:, k] for k in range(d)]) - moved

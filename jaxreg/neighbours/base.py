@@ -44,39 +44,50 @@ class Neighbours(BriefModule):
 class AbstractIndex(BriefModule):
     """Closest points of one target set."""
 
-    points: eqx.AbstractVar[Array]
-    mask: eqx.AbstractVar[Array]
+    points: eqx.AbstractVar[Float[Array, "m d"]]
+    mask: eqx.AbstractVar[Bool[Array, " m"]]
 
     @classmethod
     @abc.abstractmethod
     def build(cls, points: Points, mask: Mask | None = None) -> "AbstractIndex":
         """Prepares the search among `(m, d)` points of which `mask` are valid."""
 
+    @property
     @abc.abstractmethod
-    def lookup(
-        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
-    ) -> Int[Array, " n"]:
-        """The row of the closest valid target of each query, given as `(d, n)`.
+    def reach(self) -> Scalar:
+        """`query` calls targets farther than this invalid; inf if it finds them, too.
 
-        Any row where no target is valid or the query is not finite, and for queries
-        beyond the first `num`, which save their time.
+        In the unit of the points.
         """
 
-    def lookup_staged(
+    @abc.abstractmethod
+    def lookup(
         self,
         columns: Float[Array, "d n"],
-        coarse: Bool[Array, ""],
         num: Int[Array, ""] | None = None,
+        coarse: Bool[Array, ""] | None = None,
     ) -> Int[Array, " n"]:
-        """`lookup`, or where `coarse` is True an approximation if that is quicker."""
-        return self.lookup(columns, num)
+        """The row of the closest valid target of each query.
 
+        Any row where no target is valid or the query is not finite.
+
+        Args:
+            columns: `(d, n)` queries, neighbours in space next to each other where
+                that saves time.
+            num: queries beyond the first so many get any row, and may save their time.
+            coarse: where True, a near point will do if it is found quicker.
+        """
+
+    @abc.abstractmethod
     def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
-        """The rows of the k closest valid targets, nearest first; -1 for surplus."""
-        raise ValueError(
-            f"{type(self).__name__} finds the closest point only (k=1), not k={k}; "
-            "BruteForce takes any k"
-        )
+        """The rows of the k closest valid targets, nearest first; -1 for surplus.
+
+        Args:
+            columns: `(d, n)` queries in any order.
+            k: static, at least 1.
+
+        Raises: ValueError for more than this index can find.
+        """
 
     def query(
         self, points: Points, k: int = 1, radius: Scalar | float | None = None
@@ -93,19 +104,28 @@ class AbstractIndex(BriefModule):
         """
         if k < 1:
             raise ValueError(f"k must be at least 1, got k={k}")
-        if k == 1:
-            index = self.lookup(points.T)
-            found = jnp.broadcast_to(jnp.any(self.mask), index.shape)
-        else:
-            index = self.lookup_nearest(points.T, k).T
-            index, found = jnp.maximum(index, 0), index >= 0
-            points = points[:, None]
+        index = self.lookup_nearest(points.T, k)
+        index, points = (index[0], points) if k == 1 else (index.T, points[:, None])
+        index, found = jnp.maximum(index, 0), index >= 0
         delta = points - self.points[index]
         sq = jnp.sum(delta * delta, axis=-1)
-        valid = found & jnp.all(jnp.isfinite(points), axis=-1)
+        reach = self.reach
         if radius is not None:
-            valid = valid & (sq <= jnp.asarray(radius, sq.dtype) ** 2)
-        return Neighbours(index, jnp.where(found, sq, jnp.inf) if k > 1 else sq, valid)
+            reach = jnp.minimum(jnp.asarray(radius, sq.dtype), reach)
+        near = jnp.all(jnp.isfinite(points), axis=-1) & (sq <= reach * reach)
+        return Neighbours(index, jnp.where(found, sq, jnp.inf), found & near)
+
+
+def closest_only(
+    index: AbstractIndex, columns: Float[Array, "d n"], k: int
+) -> Int[Array, "1 n"]:
+    """`lookup_nearest` of an index that finds the closest point alone, by `lookup`."""
+    if k > 1:
+        raise ValueError(
+            f"{type(index).__name__} finds the closest point only (k=1), not k={k}; "
+            "BruteForce takes any k"
+        )
+    return jnp.where(jnp.any(index.mask), index.lookup(columns), -1)[None]
 
 
 def in_tiles(columns: Float[Array, "d n"], most: int) -> Float[Array, "a d t"]:

@@ -15,13 +15,12 @@ or more trips returns it.
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Mask, Points, Scalar
-from jaxreg.neighbours.base import AbstractIndex, Neighbours, in_tiles, map_first
+from jaxreg.neighbours.base import AbstractIndex, closest_only, in_tiles, map_first
 from jaxreg.neighbours.order import hilbert_order
 
 
@@ -37,7 +36,8 @@ _Found = tuple[Array, Array]
 class BoxTree(AbstractIndex):
     """Exact search from some thousand to a million targets; O(n + m) memory.
 
-    Queries may come in any order: `query` sorts them along the curve, `lookup` is fast
+    Queries may come in any order: `lookup_nearest` sorts them along the curve, as does
+    `query`; `lookup` is fast
     where neighbours in memory are neighbours in space (`hilbert_order`), and slower
     than brute force in random order. Ties go to any of the closest points.
     """
@@ -78,8 +78,16 @@ class BoxTree(AbstractIndex):
             jnp.max(high, axis=1).T,
         )
 
+    @property
+    def reach(self) -> Scalar:
+        """Anywhere."""
+        return jnp.asarray(jnp.inf, self.points.dtype)
+
     def lookup(
-        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
+        self,
+        columns: Float[Array, "d n"],
+        num: Int[Array, ""] | None = None,
+        coarse: Bool[Array, ""] | None = None,
     ) -> Int[Array, " n"]:
         """A closest valid target of each query."""
         n = columns.shape[1]
@@ -90,21 +98,16 @@ class BoxTree(AbstractIndex):
     def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
         """The k closest valid targets of each query; -1 for surplus."""
         n = columns.shape[1]
-        tiles = self._tiles(columns)
-        row = lax.map(lambda queries: self._rows_of_tile(queries, k), tiles)
-        return jnp.moveaxis(row, 0, 1).reshape(k, -1)[:, :n]
-
-    def query(
-        self, points: Points, k: int = 1, radius: Scalar | float | None = None
-    ) -> Neighbours:
-        """As of any index, with the queries sorted along the curve."""
-        everyone = jnp.ones(points.shape[0], bool)
-        order = hilbert_order(jnp.nan_to_num(lax.stop_gradient(points)), everyone)
-        found = super().query(points[order], k, radius)
-        place = (
-            jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=jnp.int32))
-        )
-        return jax.tree.map(lambda x: x[place], found)
+        columns = lax.stop_gradient(columns)
+        order = hilbert_order(jnp.nan_to_num(columns.T), jnp.ones(n, bool))
+        columns = columns[:, order]
+        if k == 1:
+            rows = closest_only(self, columns, k)
+        else:
+            tiles = self._tiles(columns)
+            rows = lax.map(lambda queries: self._rows_of_tile(queries, k), tiles)
+            rows = jnp.moveaxis(rows, 0, 1).reshape(k, -1)[:, :n]
+        return jnp.zeros_like(rows).at[:, order].set(rows)
 
     def _tiles(self, columns: Float[Array, "d n"]) -> Float[Array, "a d t"]:
         columns = lax.stop_gradient(columns)

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.typing import Mask, Points
-from jaxreg.neighbours.base import AbstractIndex, map_first
+from jaxreg._core.typing import Mask, Points, Scalar
+from jaxreg.neighbours.base import AbstractIndex, closest_only, map_first
 
 
 _GROUP = 16
@@ -51,8 +51,16 @@ class BruteForce(AbstractIndex):
         finite = jnp.all(jnp.isfinite(points), axis=1)
         return cls(points, finite if mask is None else mask & finite)
 
+    @property
+    def reach(self) -> Scalar:
+        """Anywhere."""
+        return jnp.asarray(jnp.inf, self.points.dtype)
+
     def lookup(
-        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
+        self,
+        columns: Float[Array, "d n"],
+        num: Int[Array, ""] | None = None,
+        coarse: Bool[Array, ""] | None = None,
     ) -> Int[Array, " n"]:
         """The closest valid target of each query, exactly."""
         groups, scale = self._groups()
@@ -72,6 +80,8 @@ class BruteForce(AbstractIndex):
 
     def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
         """The k closest valid targets of each query, exactly; -1 for surplus."""
+        if k == 1:
+            return closest_only(self, columns, k)
         groups, scale = self._groups()
 
         def nearest(queries: Array) -> Array:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.arrays import spread_rows
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.geometry.spacing import median_spacing
-from jaxreg.neighbours.base import AbstractIndex, Neighbours, in_tiles, map_first
+from jaxreg.neighbours.base import AbstractIndex, closest_only, in_tiles, map_first
 from jaxreg.neighbours.sorting import rows_in_order
 from jaxreg.neighbours.voxel_table import VoxelTable
 
@@ -93,37 +93,42 @@ class CellGrid(AbstractIndex):
         radius = width / (2 * _SLACK)
         return cls(points, mask, radius, coarse, rows, ordered.T, start, origin)
 
-    def lookup(
-        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
-    ) -> Int[Array, " n"]:
-        """The closest valid target of each query, if it lies within the radius."""
-        n = columns.shape[1]
-        tiles = in_tiles(lax.stop_gradient(columns), _TILE)
-        axes = list(self.ordered)  # copies: here, not in the loop
-        found = map_first(lambda tile: self._of_tile(tile, axes), tiles, num)
-        return self.rows[found.reshape(-1)[:n]]
+    @property
+    def reach(self) -> Scalar:
+        """The radius."""
+        return self.radius
 
-    def lookup_staged(
+    def lookup(
         self,
         columns: Float[Array, "d n"],
-        coarse: Bool[Array, ""],
         num: Int[Array, ""] | None = None,
+        coarse: Bool[Array, ""] | None = None,
     ) -> Int[Array, " n"]:
-        """Where `coarse` is True the answers of the table alone."""
+        """The closest valid target of each query, if it lies within the radius.
+
+        Where `coarse` is True the answers of the table alone.
+        """
+        columns = lax.stop_gradient(columns)
+        if coarse is None:
+            return self._exactly(columns, num)
         return lax.cond(
             coarse,
             lambda columns: self.rows[self.coarse.lookup(columns)],
-            lambda columns: self.lookup(columns, num),
-            lax.stop_gradient(columns),
+            lambda columns: self._exactly(columns, num),
+            columns,
         )
 
-    def query(
-        self, points: Points, k: int = 1, radius: Scalar | float | None = None
-    ) -> Neighbours:
-        """As of any index, and not beyond its own radius."""
-        if radius is None:
-            return super().query(points, k, self.radius)
-        return super().query(points, k, jnp.minimum(radius, self.radius))
+    def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
+        """The closest only."""
+        return closest_only(self, columns, k)
+
+    def _exactly(
+        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None
+    ) -> Int[Array, " n"]:
+        tiles = in_tiles(columns, _TILE)
+        axes = list(self.ordered)  # copies: here, not in the loop
+        found = map_first(lambda tile: self._of_tile(tile, axes), tiles, num)
+        return self.rows[found.reshape(-1)[: columns.shape[1]]]
 
     def _of_tile(
         self, queries: Float[Array, "d t"], axes: list[Float[Array, " m"]]

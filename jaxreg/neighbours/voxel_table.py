@@ -28,8 +28,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.typing import Mask, Points
-from jaxreg.neighbours.base import AbstractIndex
+from jaxreg._core.typing import Mask, Points, Scalar
+from jaxreg.neighbours.base import AbstractIndex, closest_only
 from jaxreg.neighbours.feature_transform import feature_transform, smallest
 
 
@@ -99,8 +99,16 @@ class VoxelTable(AbstractIndex):
             points, mask, table, coordinates, origin, cell, resolution, candidates
         )
 
+    @property
+    def reach(self) -> Scalar:
+        """Anywhere."""
+        return jnp.asarray(jnp.inf, self.points.dtype)
+
     def lookup(
-        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None = None
+        self,
+        columns: Float[Array, "d n"],
+        num: Int[Array, ""] | None = None,
+        coarse: Bool[Array, ""] | None = None,
     ) -> Int[Array, " n"]:
         """The nearest of the candidates of each query's cell; `num` saves nothing."""
         home = _cell_of(columns, self.origin, self.cell, self.resolution)
@@ -117,6 +125,8 @@ class VoxelTable(AbstractIndex):
 
     def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
         """The k nearest of the candidates of each query's cell; -1 for surplus."""
+        if k == 1:
+            return closest_only(self, columns, k)
         if k > self.candidates:
             raise ValueError(
                 f"VoxelTable holds {self.candidates} candidates a cell, not k={k}; "

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +20,12 @@ from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
 from jaxreg.particle.conclude import Pair, conclude
 from jaxreg.particle.priors import AbstractPrior, GaussianPrior, UniformPrior
 from jaxreg.particle.state import Particles
-from jaxreg.registrar import AbstractRegistrar, RegistrationSolution, SearchTrace
+from jaxreg.registrar import (
+    AbstractRegistrar,
+    Frames,
+    RegistrationSolution,
+    SearchTrace,
+)
 from jaxreg.robust import AbstractKernel
 
 
@@ -67,13 +71,11 @@ class AbstractSearch(AbstractRegistrar):
     def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
         """Searches on the points of the problem."""
 
-    def in_frames(
-        self, centred: Callable[[Motion], Motion], d: int
-    ) -> "AbstractSearch":
+    def in_frames(self, frames: Frames) -> "AbstractSearch":
         """With the prior's poses in the frames of `solve`."""
         if self.prior is None:
             return self
-        return eqx.tree_at(lambda m: m.prior, self, self.prior.in_frames(centred, d))
+        return eqx.tree_at(lambda m: m.prior, self, self.prior.in_frames(frames))
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
         """Without noise that fills the box, thinned to `max_points`, with normals."""

@@ -1,7 +1,6 @@
 """The contract of registration methods and what they return."""
 
 import abc
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -12,10 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.status import Status
-from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
+from jaxreg._core.typing import Key, Mask, Motion, Points
 from jaxreg.cloud import PointCloud
 from jaxreg.geometry import lie
 from jaxreg.linear.small import solve_semidefinite
+from jaxreg.registrar.frames import Frames
 from jaxreg.registrar.trace import SearchTrace
 
 
@@ -159,25 +159,13 @@ class AbstractRegistrar(BriefModule):
     centroids and scaled so that the target's root mean square radius is one.
     """
 
-    def in_unit(self, length: Scalar) -> "AbstractRegistrar":
-        """The method with its lengths, given in the unit of the input, in `length`s.
+    @abc.abstractmethod
+    def in_frames(self, frames: Frames) -> "AbstractRegistrar":
+        """The method with its own lengths and poses in the frames of `solve`.
 
-        Most methods have none: their lengths follow from the data.
+        Users give them in the frames and the unit of the input. The method itself if
+        it has none, because its lengths follow from the data.
         """
-        return self
-
-    def in_frames(
-        self, centred: Callable[[Motion], Motion], d: int
-    ) -> "AbstractRegistrar":
-        """The method with its poses, given in the frames of the input, in `solve`'s.
-
-        Most methods have none.
-
-        Args:
-            centred: maps a pose from the former frames to the latter.
-            d: dimension of the points.
-        """
-        return self
 
     @abc.abstractmethod
     def prepare(self, points: Points, mask: Mask) -> PointCloud:

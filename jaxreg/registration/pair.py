@@ -12,9 +12,8 @@ from jaxreg._core.arrays import on_both
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import centroid, rms_radius
-from jaxreg.geometry import lie
 from jaxreg.local import Curvature, tangent_unit
-from jaxreg.registrar import AbstractRegistrar, Modes, RegistrationSolution
+from jaxreg.registrar import AbstractRegistrar, Frames, Modes, RegistrationSolution
 
 
 # Clouds are padded to one size where the larger is at most so many times as large.
@@ -30,8 +29,8 @@ def register_pair(
     """Of sources, targets and their masks; traced."""
     source, target, *masks = pair
     sides = on_both(_Side.of, *_levelled((source, masks[0]), (target, masks[1])))
-    frames = _Frames(sides[0].mean, sides[1].mean, sides[1].radius)
-    method = method.in_unit(frames.radius).in_frames(frames.enter, source.shape[1])
+    frames = Frames(sides[0].mean, sides[1].mean, sides[1].radius)
+    method = method.in_frames(frames)
     source_cloud, target_cloud = on_both(
         lambda cloud: method.prepare(*cloud),
         *(((side.points - side.mean) / frames.radius, side.mask) for side in sides),
@@ -40,7 +39,7 @@ def register_pair(
     solution = method.solve(
         source_cloud.first(len(source)), target_cloud.first(len(target)), init, key
     )
-    return frames.leave(solution, sides[0].enough & sides[1].enough)
+    return _leave(frames, solution, sides[0].enough & sides[1].enough)
 
 
 class _Side(eqx.Module):
@@ -71,66 +70,47 @@ class _Side(eqx.Module):
         return cls(points, mask, centroid(frozen, mask), radius, enough)
 
 
-class _Frames(eqx.Module):
-    """Frames of the input, and those of `solve` about the centroids of the clouds.
+def _leave(
+    frames: Frames, solution: RegistrationSolution, enough: Array
+) -> RegistrationSolution:
+    """A solution in the frames and unit of the input; none if not `enough`."""
 
-    Attributes:
-        source_mean, target_mean: the centroids.
-        radius: the unit in the latter.
-    """
+    def back(T: Motion) -> Motion:
+        T = frames.leave(T)
+        return jnp.where(enough, T, jnp.eye(len(T), dtype=T.dtype))
 
-    source_mean: Float[Array, " d"]
-    target_mean: Float[Array, " d"]
-    radius: Scalar
-
-    def enter(self, T: Motion) -> Motion:
-        """A pose in the frames of `solve`."""
-        R = lie.rotation(T).astype(self.radius.dtype)
-        t = lie.translation(T).astype(self.radius.dtype)
-        shift = R @ self.source_mean + t - self.target_mean
-        return lie.compose(R, shift / self.radius)
-
-    def leave(self, solution: RegistrationSolution, enough: Array):
-        """A solution in the frames and unit of the input; none if not `enough`."""
-
-        def back(T: Motion) -> Motion:
-            R = lie.rotation(T)
-            t = self.radius * lie.translation(T) + self.target_mean
-            T = lie.compose(R, t - R @ self.source_mean)
-            return jnp.where(enough, T, jnp.eye(len(T), dtype=T.dtype))
-
-        status = jnp.where(enough, solution.status, Status.TOO_FEW_POINTS)
-        curvature = Curvature(
-            solution.H, solution.b, solution.error, solution.covariance
-        ).scaled(self.radius)
-        modes = solution.modes
-        trace = solution.trace
-        if trace is not None:
-            width = self.radius * trace.kernel_width
-            trace = dataclasses.replace(trace, kernel_width=width)
-        unit = tangent_unit(self.radius, modes.covariance.shape[-1])
-        return RegistrationSolution(
-            T_target_source=back(solution.T_target_source),
-            status=status.astype(jnp.int32),
-            fitness=jnp.where(enough, solution.fitness, 0),
-            inlier_rmse=self.radius * solution.inlier_rmse,
-            num_inliers=jnp.where(enough, solution.num_inliers, 0),
-            overlap=jnp.where(enough, solution.overlap, 0),
-            num_steps=solution.num_steps,
-            H=curvature.H,
-            b=curvature.b,
-            error=curvature.error,
-            covariance=curvature.covariance,
-            modes=Modes(
-                jax.vmap(back)(modes.T_target_source),
-                modes.weight,
-                modes.fitness,
-                modes.overlap,
-                self.radius * modes.inlier_rmse,
-                modes.covariance * jnp.outer(unit, unit),
-            ),
-            trace=trace,
-        )
+    status = jnp.where(enough, solution.status, Status.TOO_FEW_POINTS)
+    curvature = Curvature(
+        solution.H, solution.b, solution.error, solution.covariance
+    ).scaled(frames.radius)
+    modes = solution.modes
+    trace = solution.trace
+    if trace is not None:
+        width = frames.radius * trace.kernel_width
+        trace = dataclasses.replace(trace, kernel_width=width)
+    unit = tangent_unit(frames.radius, modes.covariance.shape[-1])
+    return RegistrationSolution(
+        T_target_source=back(solution.T_target_source),
+        status=status.astype(jnp.int32),
+        fitness=jnp.where(enough, solution.fitness, 0),
+        inlier_rmse=frames.radius * solution.inlier_rmse,
+        num_inliers=jnp.where(enough, solution.num_inliers, 0),
+        overlap=jnp.where(enough, solution.overlap, 0),
+        num_steps=solution.num_steps,
+        H=curvature.H,
+        b=curvature.b,
+        error=curvature.error,
+        covariance=curvature.covariance,
+        modes=Modes(
+            jax.vmap(back)(modes.T_target_source),
+            modes.weight,
+            modes.fitness,
+            modes.overlap,
+            frames.radius * modes.inlier_rmse,
+            modes.covariance * jnp.outer(unit, unit),
+        ),
+        trace=trace,
+    )
 
 
 def _levelled(

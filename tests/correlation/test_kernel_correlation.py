@@ -13,6 +13,7 @@ import jaxreg as jr
 from jaxreg import Status
 from jaxreg.cloud import PointCloud
 from jaxreg.correlation import KernelCorrelation, kernel_correlation
+from jaxreg.registrar import Frames
 
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -231,9 +232,10 @@ def test_optimum_is_that_of_scipy_in_space_and_in_any_unit():
 
 
 def test_bandwidth_is_a_length_of_the_input_or_a_share_of_the_target():
-    half = KernelCorrelation(0.5).in_unit(jnp.asarray(2.0))
+    frames = Frames(jnp.zeros(3), jnp.zeros(3), jnp.asarray(2.0))
+    half = KernelCorrelation(0.5).in_frames(frames)
     assert float(jnp.asarray(half.bandwidth)) == 0.25
-    own = KernelCorrelation().in_unit(jnp.asarray(2.0))
+    own = KernelCorrelation().in_frames(frames)
     assert own.bandwidth is None
     fine, coarse = (float(own.width(jnp.asarray(x))) for x in (0.01, 0.2))
     assert fine == pytest.approx(0.2)

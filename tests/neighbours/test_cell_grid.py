@@ -16,7 +16,7 @@ from jaxreg.neighbours import BruteForce, CellGrid, index_within
 def _found(target, mask, queries, radius):
     grid = CellGrid.build(target, mask, radius=radius)
     far = jnp.asarray(True)
-    return grid.radius, grid.query(queries), grid.lookup_staged(queries.T, far)
+    return grid.radius, grid.query(queries), grid.lookup(queries.T, coarse=far)
 
 
 @pytest.mark.parametrize("d", [2, 3])

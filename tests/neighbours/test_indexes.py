@@ -8,7 +8,6 @@ from clouds import M, N, clouds, compiled, distances, few, kinds, scales, seeds
 from hypothesis import given
 
 from jaxreg.neighbours import (
-    AbstractIndex,
     BoxTree,
     BruteForce,
     CellGrid,
@@ -152,21 +151,9 @@ def test_squared_distances_have_gradients():
     np.testing.assert_allclose(to_target, expected, rtol=1e-5, atol=1e-5)
 
 
-class _First(AbstractIndex):
-    points: jax.Array
-    mask: jax.Array
-
-    @classmethod
-    def build(cls, points, mask=None):
-        return cls(points, jnp.ones(len(points), bool) if mask is None else mask)
-
-    def lookup(self, columns, num=None):
-        return jnp.zeros(columns.shape[1], jnp.int32)
-
-
 def test_a_k_that_cannot_be_answered_is_refused():
     points = jnp.zeros((4, 3), jnp.float32)
     with pytest.raises(ValueError, match=r"k must be at least 1, got k=0"):
-        _First.build(points).query(points, k=0)
-    with pytest.raises(ValueError, match=r"_First finds .* \(k=1\), not k=2"):
-        _First.build(points).query(points, k=2)
+        BruteForce.build(points).query(points, k=0)
+    with pytest.raises(ValueError, match=r"CellGrid finds .* \(k=1\), not k=2"):
+        CellGrid.build(points, radius=1.0).query(points, k=2)

@@ -8,6 +8,7 @@ from helpers import motion, pose_error
 
 from jaxreg.local import decoupled_error
 from jaxreg.particle import GaussianPrior, GivenParticles, UniformPrior
+from jaxreg.registrar import Frames
 
 
 NUM = 4000
@@ -44,9 +45,14 @@ def test_given_particles_are_taken_as_they_are_and_follow_the_frames():
     T = np.stack([motion(i, 3) for i in range(5)])
     prior = GivenParticles(T)
     np.testing.assert_allclose(prior.draw(KEY, 5, 3, None, jnp.float32), T, atol=1e-6)
-    A = jnp.asarray(motion(9, 3), jnp.float32)
-    moved = prior.in_frames(lambda T: A @ T, 3)
-    np.testing.assert_allclose(moved.T_target_source, np.asarray(A) @ T, atol=1e-5)
+    source_mean, target_mean = jnp.asarray([1.0, 0, 2]), jnp.asarray([0, 3.0, 0])
+    frames = Frames(source_mean, target_mean, jnp.asarray(2.0))
+    moved = np.asarray(prior.in_frames(frames).T_target_source)
+    image = (T[:, :3, :3] @ source_mean + T[:, :3, 3] - target_mean) / 2
+    np.testing.assert_allclose(moved[:, :3, 3], image, atol=1e-5)
+    np.testing.assert_allclose(moved[:, :3, :3], T[:, :3, :3], atol=1e-6)
+    back = jax.vmap(frames.leave)(jnp.asarray(moved))
+    np.testing.assert_allclose(back, T, atol=1e-5)
 
 
 @pytest.mark.parametrize(

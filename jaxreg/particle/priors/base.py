@@ -1,7 +1,6 @@
 """The contract of priors."""
 
 import abc
-from collections.abc import Callable
 from typing import Any
 
 from jaxtyping import Array, Float
@@ -9,6 +8,7 @@ from jaxtyping import Array, Float
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.typing import Key, Motion
+from jaxreg.registrar import Frames
 
 
 class AbstractPrior(BriefModule):
@@ -28,9 +28,12 @@ class AbstractPrior(BriefModule):
             dtype: of the result.
         """
 
-    def in_frames(self, centred: Callable[[Motion], Motion], d: int) -> "AbstractPrior":
-        """The prior with its poses, if it holds any, in the frames of the search."""
-        return self
+    @abc.abstractmethod
+    def in_frames(self, frames: Frames) -> "AbstractPrior":
+        """The prior with its poses in the frames of the search.
+
+        Users give them in the frames of the input. The prior itself if it has none.
+        """
 
 
 def check_spread(prior: object, name: str, spread: Array | float) -> None:

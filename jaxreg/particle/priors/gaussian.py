@@ -12,6 +12,7 @@ from jaxreg._core.typing import Key, Motion
 from jaxreg.geometry import lie
 from jaxreg.local import turn_and_shift
 from jaxreg.particle.priors.base import AbstractPrior, check_spread
+from jaxreg.registrar import Frames
 
 
 class GaussianPrior(AbstractPrior):
@@ -41,6 +42,10 @@ class GaussianPrior(AbstractPrior):
                 "GaussianPrior: translation_spread and rotation_spread are both 0, "
                 "which leaves one particle; use ICP from the guess."
             )
+
+    def in_frames(self, frames: Frames) -> "GaussianPrior":
+        """Itself: it holds no poses."""
+        return self
 
     def draw(
         self, key: Key, num: int, d: int, init: Motion | None, dtype: Any

@@ -1,6 +1,5 @@
 """Particles of the caller's own."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxreg._core.checks import as_float_array
 from jaxreg._core.typing import Key, Motion
 from jaxreg.particle.priors.base import AbstractPrior
+from jaxreg.registrar import Frames
 
 
 def _poses(T_target_source: object) -> Array:
@@ -54,12 +54,10 @@ class GivenParticles(AbstractPrior):
         self.check_number(num, "num")
         return self.T_target_source.astype(dtype)
 
-    def in_frames(
-        self, centred: Callable[[Motion], Motion], d: int
-    ) -> "GivenParticles":
-        """With each pose `centred`."""
-        self._check_dimension(d)
-        return GivenParticles(jax.vmap(centred)(self.T_target_source))
+    def in_frames(self, frames: Frames) -> "GivenParticles":
+        """With each pose between the centroids."""
+        self._check_dimension(frames.d)
+        return GivenParticles(jax.vmap(frames.enter)(self.T_target_source))
 
     def _check_dimension(self, d: int) -> None:
         if self.T_target_source.shape[-1] != d + 1:

@@ -9,6 +9,7 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key, Motion
 from jaxreg.geometry import lie
 from jaxreg.particle.priors.base import AbstractPrior, check_spread
+from jaxreg.registrar import Frames
 
 
 class UniformPrior(AbstractPrior):
@@ -27,6 +28,10 @@ class UniformPrior(AbstractPrior):
     def __check_init__(self) -> None:
         """Refuses a negative spread."""
         check_spread(self, "translation_spread", self.translation_spread)
+
+    def in_frames(self, frames: Frames) -> "UniformPrior":
+        """Itself: it holds no poses."""
+        return self
 
     def draw(
         self, key: Key, num: int, d: int, init: Motion | None, dtype: Any
