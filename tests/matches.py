@@ -19,7 +19,7 @@ found_at = jax.jit(match)
 class RowByRow(BruteForce):
     """Point i of the source belongs to point i of the target."""
 
-    def lookup(self, columns, num=None):
+    def lookup(self, columns, num=None, coarse=None):
         return jnp.arange(columns.shape[1], dtype=jnp.int32)
 
 
