@@ -7,7 +7,7 @@ from jaxreg.io.poses.tum import read_tum, write_tum
 from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
 
 
-def test_quaternions_agree_with_scipy_also_at_half_turns():
+def test_quaternions_there_and_back_also_at_half_turns():
     half = np.pi * np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0.8, 0]]])
     R = Rotation.concatenate(
         [
@@ -20,6 +20,11 @@ def test_quaternions_agree_with_scipy_also_at_half_turns():
     back = motions_from_xyzw(np.zeros((len(q), 3)), 3 * q)
     np.testing.assert_allclose(back[:, :3, :3], R.as_matrix(), atol=1e-14)
     np.testing.assert_allclose(np.abs(np.sum(q * R.as_quat(), axis=1)), 1, atol=1e-14)
+    assert (q[:, 3] >= 0).all()
+    lost = np.stack([np.full((3, 3), np.nan), np.eye(3)])
+    np.testing.assert_array_equal(
+        xyzw_from_rotations(lost), [[np.nan] * 4, [0, 0, 0, 1]]
+    )
 
 
 def test_round_trip_in_3d_and_2d(tmp_path):

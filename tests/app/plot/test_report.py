@@ -139,8 +139,8 @@ def test_without_plotly_the_package_to_install_is_named(
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    with browser(tmp_path_factory.mktemp("profile")) as opened:
+def page() -> Iterator[Page]:
+    with browser() as opened:
         yield opened
 
 
