@@ -70,6 +70,15 @@ def test_median_spacing_is_that_of_a_grid_and_ignores_duplicates():
     assert float(jax.jit(median_spacing)(doubled, jnp.zeros(512, bool))) == 0
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_median_spacing_is_to_the_second_other_point_and_in_space_the_fourth(d):
+    points = blob(60, d)  # every one is asked
+    mask = np.arange(60) < 50
+    others = KDTree(points[mask]).query(points[mask], 2 * (d - 1) + 1)[0][:, -1]
+    found = jax.jit(median_spacing)(jnp.asarray(points), jnp.asarray(mask))
+    assert float(found) == pytest.approx(np.median(others), rel=1e-4)
+
+
 def test_normals_of_a_line_in_space_are_undefined():
     line = jnp.linspace(0, 1, 64)[:, None] * jnp.asarray([1.0, 2.0, 3.0])
     normals = jax.jit(estimate_normals)(line, jnp.ones(64, bool))

@@ -132,6 +132,9 @@ def test_unit_and_place_of_the_input_do_not_matter():
     np.testing.assert_allclose(
         in_mm.T_target_source[:3, :3], sol.T_target_source[:3, :3], atol=1e-3
     )
+    np.testing.assert_allclose(
+        in_mm.modes.inlier_rmse / 1000, sol.modes.inlier_rmse, rtol=0.05, atol=1e-5
+    )
     far = jr.register(source + np.float32(100), target, FILTER, key=key)
     R = far.T_target_source[:3, :3]
     assert pose_error(R, T[:3, :3])[0] < 0.03

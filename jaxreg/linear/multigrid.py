@@ -104,7 +104,8 @@ def _coarser(matrix: GraphLaplacian) -> tuple[_Level, GraphLaplacian]:
     blocks = blocks.at[agg.slot].add(weight, mode="drop")
     own = jnp.zeros((count, k, k), own.dtype).at[agg.parent].add(own)
     lost = jnp.where(agg.lost[:, None, None], weight, 0)
-    # Edges without room tie both ends to the ground: stiffer, so still safe.
+    # Edges without room tie both ends to the ground: at least half as stiff, and stiff
+    # where both ends move alike, so still safe.
     own = jax.lax.cond(
         jnp.any(agg.lost),
         lambda: own.at[agg.parent[i]].add(lost).at[agg.parent[j]].add(lost),

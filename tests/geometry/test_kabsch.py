@@ -75,3 +75,20 @@ def test_derivative_at_coinciding_singular_values_is_the_true_one():
         dM = jnp.asarray(np.random.default_rng(0).standard_normal((3, 3)))
         _, dR = jax.jvp(nearest_rotation, (jnp.eye(3),), (dM,))
         np.testing.assert_allclose(dR, (dM - dM.T) / 2, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_derivative_is_that_of_differences_on_both_sides_of_a_reflection(seed):
+    rng = np.random.default_rng(seed)
+    M, dM = rng.standard_normal((2, 3, 3))
+    M[0] *= (-1) ** seed * np.sign(np.linalg.det(M))
+
+    def rotation(M: np.ndarray) -> np.ndarray:
+        U, _, Vt = np.linalg.svd(M)
+        return U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+
+    with jax.enable_x64(True):
+        R, dR = jax.jvp(nearest_rotation, (jnp.asarray(M),), (jnp.asarray(dM),))
+    np.testing.assert_allclose(R, rotation(M), atol=1e-12)
+    difference = (rotation(M + 1e-6 * dM) - rotation(M - 1e-6 * dM)) / 2e-6
+    np.testing.assert_allclose(dR, difference, rtol=1e-5, atol=1e-6)

@@ -22,17 +22,26 @@ tangents_3 = hnp.arrays(np.float64, 3, elements=st.floats(-1.5, 1.5))
 tangents_6 = hnp.arrays(np.float64, 6, elements=st.floats(-1.5, 1.5))
 
 
+@jax.jit
+def _there_and_back(v):
+    T = lie.exp(v)
+    return T, lie.log(T), lie.inverse(T) @ T
+
+
 @settings(max_examples=30, deadline=None)
 @given(v=st.one_of(tangents_3, tangents_6))
 @example(v=np.array([1, 0.3, 1e-8]))
 @example(v=np.array([1, 0.3, 0.2, 1e-6, 0, 1e-6]))
 @example(v=np.array([1, 0.3, 0.2, 0.03, 0, 0.001]))
+# Just below the angle at which series take over, far enough to see their last terms.
+@example(v=np.array([30, 10, 0.0299]))
+@example(v=np.array([30, 10, 20, 0.029, 0.001, 0.005]))
 def test_exp_is_the_matrix_exponential_translation_first(v):
     with jax.enable_x64(True):
-        T = lie.exp(jnp.asarray(v))
-        np.testing.assert_allclose(T, expm(_hat(v)), atol=1e-12)
-        np.testing.assert_allclose(lie.log(T), v, atol=1e-9)
-        np.testing.assert_allclose(lie.inverse(T) @ T, np.eye(len(T)), atol=1e-12)
+        T, again, left = _there_and_back(jnp.asarray(v))
+    np.testing.assert_allclose(T, expm(_hat(v)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(again, v, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(left, np.eye(len(T)), atol=1e-12)
 
 
 @settings(max_examples=20, deadline=None)
@@ -84,6 +93,17 @@ def test_orthonormalise_gives_the_nearest_rotation():
 
 
 @pytest.mark.parametrize("d", [2, 3])
+def test_orthonormalise_never_reflects(d):
+    T = np.tile(np.eye(d + 1), (20, 1, 1))
+    T[:, :d, :d] = np.random.default_rng(d).standard_normal((20, d, d))
+    found = np.asarray(jax.jit(lie.orthonormalise)(jnp.asarray(T, jnp.float32)))
+    U, _, Vt = np.linalg.svd(T[:, :d, :d])
+    U[:, :, -1] *= np.linalg.det(U @ Vt)[:, None]
+    assert 0 < np.sum(np.linalg.det(T) < 0) < 20
+    np.testing.assert_allclose(found[:, :d, :d], U @ Vt, atol=1e-4)
+
+
+@pytest.mark.parametrize("d", [2, 3])
 def test_random_rotations_are_rotations_and_uniform(d):
     R = np.asarray(lie.random_rotations(jax.random.key(0), 4000, d, jnp.float32))
     np.testing.assert_allclose(
@@ -96,7 +116,7 @@ def test_random_rotations_are_rotations_and_uniform(d):
 
 
 @pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize("size", [1e-3, 0.5, 2.5])
+@pytest.mark.parametrize("size", [0.029, 0.5, 2.5])
 def test_log_jacobian_is_the_derivative_of_the_logarithm(d, size):
     k = lie.tangent_dim(d)
     with jax.enable_x64(True):

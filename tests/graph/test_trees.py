@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxreg.graph import trees
+from jaxreg.graph import PoseGraph, trees
 
 
 V, E = 12, 30
@@ -88,6 +88,50 @@ def test_shortest_paths_reach_what_is_connected_exactly(seed, present):
     np.testing.assert_array_equal(paths.via == E, ~inner)
     above = np.asarray(trees.ancestors(paths.parent))
     np.testing.assert_array_equal(above[reached, root], True)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([1, 2, 8, 9, 16, 17]))
+def test_ancestors_are_all_frames_above(seed, num):
+    rng = np.random.default_rng(seed)
+    # Frames below their parents, a chain among the cases, in any numbering.
+    up = np.maximum(np.arange(num) - 1, 0)
+    if seed % 2:
+        up = rng.integers(0, up + 1)
+    name = rng.permutation(num)
+    parent = np.empty(num, np.int32)
+    parent[name] = name[up]
+    expected = np.zeros((num, num), bool)
+    for i in range(num):
+        at = i
+        while not expected[i, at]:
+            expected[i, at], at = True, parent[at]
+    np.testing.assert_array_equal(trees.ancestors(jnp.asarray(parent)), expected)
+
+
+def test_weights_below_a_thousandth_of_the_largest_count_as_that():
+    # Two steps of lengths 1 and 900, or one of 850; then one of 5000, or two of 600.
+    T = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    T[:, 0, 3] = [1, 1, 10]
+    edges = jnp.array([[0, 1], [1, 2], [0, 2]], jnp.int32)
+    for length, expected in (([1, 900, 850], 10), ([600, 600, 5000], 10)):
+        weight = 1 / np.array([*length], np.float32)
+        some = np.append(weight, 1).astype(np.float32)  # another edge is the largest
+        T_all = np.concatenate([T, T[:1]])
+        ends = jnp.concatenate([edges, jnp.array([[0, 3]], jnp.int32)])
+        found = shortest(ends, jnp.asarray(T_all), jnp.asarray(some), 4, 0)
+        np.testing.assert_allclose(found.T_root_i[2, 0, 3], expected)
+
+
+def test_frames_that_follow_each_other_are_joined_first():
+    # 0-1-2-3 of weight 1, closures of weight 1.5 that are wrong, and no edge 3-4.
+    edges = np.array([[0, 1], [2, 1], [2, 3], [0, 2], [3, 1], [4, 0]], np.int32)
+    T = np.tile(np.eye(3, dtype=np.float32), (6, 1, 1))
+    T[:, 0, 2] = [1, -1, 1, 7, 7, 5]
+    weight = np.array([1, 1, 1, 1.5, 1.5, 0.1], np.float32)
+    graph = PoseGraph.from_edges(edges, T, weight=weight)
+    x = trees.along_frames(graph)[:, 0, 2]
+    np.testing.assert_allclose(x, [0, 1, 2, 3, -5])
 
 
 def test_paths_are_those_of_least_variance():

@@ -5,7 +5,9 @@ import pytest
 import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
-from jaxreg.linear.laplacian import DENSE_LIMIT, solve_flow
+from jaxreg.linear.krylov import conjugate_gradients
+from jaxreg.linear.laplacian import DENSE_LIMIT, solve_flow, solve_laplacian
+from jaxreg.linear.multigrid import Laplacian, _coarser, anchored, multigrid
 
 
 solve = jax.jit(solve_flow, static_argnums=3)
@@ -74,3 +76,83 @@ def test_frames_that_nothing_holds_stay(num):
     keep = ~last
     expected = oracle(edges[keep], weight[keep], flow[keep], num - 1)
     np.testing.assert_allclose(x[:-1], expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("num", [40, 700])
+def test_what_arrives_need_not_leave_but_at_frame_0(num):
+    edges, weight, rhs = system(num, 3, 1.0)
+    rhs = rhs[:num]
+    L = dense(edges, weight, num)
+    expected = np.linalg.solve(L[1:, 1:], rhs[1:])
+    with jax.enable_x64(True):
+        arrays = map(jnp.asarray, (edges, weight, rhs))
+        x = jax.jit(solve_laplacian)(*arrays)
+    np.testing.assert_array_equal(x[0], 0)
+    np.testing.assert_allclose(x[1:], expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("num", [40, 700])
+def test_the_unit_of_the_weights_does_not_matter(num):
+    edges, weight, flow = system(num, 1, 1.0)
+    arrays = jnp.asarray(edges), jnp.float32(weight), jnp.float32(flow)
+    x = solve(*arrays, num)
+    for unit in (1e-30, 1e30):
+        again = solve(arrays[0], arrays[1] * jnp.float32(unit), arrays[2], num)
+        np.testing.assert_allclose(again, x, atol=2e-3 * np.abs(x).max())
+
+
+def dense(edges: np.ndarray, weight: np.ndarray, num: int) -> np.ndarray:
+    """The Laplacian, edge by edge."""
+    L = np.zeros((num, num))
+    for (i, j), w in zip(edges, weight, strict=True):
+        L[[i, j], [i, j]] += w
+        L[[i, j], [j, i]] -= w
+    return L
+
+
+def _formed(matrix: Laplacian) -> np.ndarray:
+    """Applied to all unit vectors."""
+    num = matrix.own.shape[0]
+    return np.asarray(matrix(jnp.eye(num, dtype=matrix.own.dtype)[:, None]))[:, 0]
+
+
+def test_a_coarser_level_is_about_as_stiff_as_frames_that_move_as_one():
+    # So many edges between aggregates that some find no room.
+    rng, num = np.random.default_rng(0), 800
+    i = rng.integers(0, num, 4000)
+    edges = np.stack([i, (i + rng.integers(1, num, 4000)) % num], axis=1)
+    weight = 10 ** rng.uniform(-3, 0, 4000)
+    with jax.enable_x64(True):
+        matrix = anchored(jnp.asarray(edges), jnp.asarray(weight)[:, None, None], num)
+        np.testing.assert_allclose(
+            _formed(matrix), dense(edges, weight, num) + np.diag(matrix.own[:, 0, 0])
+        )
+        level, coarser = jax.jit(_coarser)(matrix)
+        P = np.eye(coarser.own.shape[0])[np.asarray(level.parent)]
+        expected = P.T @ _formed(matrix) @ P
+        found = _formed(coarser)
+    diagonal = np.diag(expected)
+    np.testing.assert_allclose(np.diag(found), diagonal, rtol=1e-9)
+    # (x - y)^2 is at most twice x^2 + y^2, by which an edge without room counts.
+    root = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
+    least = np.linalg.eigvalsh((2 * found - expected) * root[:, None] * root)[0]
+    assert least > -1e-9
+    assert np.abs(found - expected).max() > 1e-3  # some were lost
+
+
+def test_cycles_leave_little_to_the_search():
+    edges, weight, flow = system(3000, 0, 2.0)
+    matrix = anchored(jnp.asarray(edges), jnp.float32(weight)[:, None, None], 3000)
+    rhs = np.zeros((3000, 1, 1), np.float32)
+    np.add.at(rhs[:, 0, 0], edges[:, 1], flow[:, 0])
+    np.add.at(rhs[:, 0, 0], edges[:, 0], -flow[:, 0])
+
+    @jax.jit
+    def rounds(matrix, rhs):
+        inverse = multigrid(matrix)
+        return conjugate_gradients(matrix, inverse, rhs, tolerance=1e-3, max_steps=200)
+
+    x, num = rounds(matrix, jnp.asarray(rhs))
+    left = matrix(x) - rhs
+    assert np.linalg.norm(left) < 1e-2 * np.linalg.norm(rhs)
+    assert int(num) <= 30

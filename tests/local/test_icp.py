@@ -1,5 +1,6 @@
 """`ICP`: what it reports, and input that leaves it little to work with."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,7 +8,12 @@ from helpers import blob, motion, move, pose_error
 
 import jaxreg as jr
 from jaxreg import Status
+from jaxreg.cloud import PointCloud
 from jaxreg.datasets import sculpture_scans
+from jaxreg.local import GaussNewton, LocalOptimiser
+from jaxreg.local.descent import Limits
+from jaxreg.matching import Problem, match
+from jaxreg.neighbours import BruteForce
 from jaxreg.robust import L2
 
 
@@ -60,6 +66,14 @@ def test_unit_of_the_input_scales_curvature_and_covariance(near):
     np.testing.assert_allclose(
         mm.covariance / np.outer(unit, unit), sol.covariance, rtol=0.1, atol=1e-7
     )
+    np.testing.assert_allclose(mm.inlier_rmse / 1000, sol.inlier_rmse, rtol=0.01)
+    np.testing.assert_allclose(mm.error / 1e6, sol.error, rtol=0.01)
+    H = np.asarray(mm.H) * np.outer(unit, unit) / 1e6
+    np.testing.assert_allclose(H, sol.H, rtol=0.01, atol=1e-3 * np.abs(sol.H).max())
+    # The only mode of a local method is its solution.
+    for field in ("T_target_source", "inlier_rmse", "covariance", "fitness", "overlap"):
+        of_mode = getattr(mm.modes, field)[0]
+        np.testing.assert_allclose(of_mode, getattr(mm, field), rtol=1e-5)
 
 
 def test_pairs_beyond_the_largest_distance_do_not_count(near):
@@ -71,6 +85,33 @@ def test_pairs_beyond_the_largest_distance_do_not_count(near):
     free = jr.register(far, target, jr.ICP(jr.PointToPoint(), L2()), init=init)
     assert pose_error(sol.T_target_source, T)[0] < 0.1
     assert pose_error(free.T_target_source, T)[0] > 0.2
+
+
+@pytest.mark.parametrize("residual", [jr.PointToPoint(), jr.PlaneToPlane()])
+def test_a_descent_limited_to_near_pairs_is_that_of_the_near_points(near, residual):
+    """What lies beyond the largest distance might as well be masked."""
+    source, target, _, init, _ = near
+    far = np.concatenate([source[: N // 2], source[: N // 2] + np.float32(3)])
+
+    def cloud(points: np.ndarray, num: int) -> PointCloud:
+        normals = jnp.full(points.shape, 3**-0.5)
+        return PointCloud(jnp.asarray(points), normals, jnp.arange(M) < num)
+
+    source, target = np.resize(far, (M, 3)), cloud(target, M)
+    index = BruteForce.build(target.points)
+    problems = [Problem.of(cloud(source, num), target, index) for num in (N, N // 2)]
+    limits = Limits(1, False, *map(jnp.float32, (0.3, 0.01, 1e-4)))
+    optimiser = LocalOptimiser(residual, L2(), GaussNewton())
+    T = jnp.asarray(init, jnp.float32)
+
+    @jax.jit
+    def pulls(problem):
+        found = limits.within_reach(match(problem, T))
+        return residual.normal_equations(found, optimiser.weights(found, limits.floor))
+
+    for found, expected in zip(*map(pulls, problems), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3)
+    assert float(jnp.linalg.norm(pulls(problems[1])[1])) > 1
 
 
 def test_a_plane_on_a_plane_is_degenerate():

@@ -80,6 +80,29 @@ def test_conflicts_lessen_the_overlap():
     assert float(mutual_overlap(none, none)) == 0
 
 
+@pytest.mark.parametrize("shares", [(0.6, 0.5), (0.9, 0.1), (0.1, 0.9)])
+def test_overlap_is_the_mean_of_both_shares_and_at_most_twice_the_lesser(shares):
+    one, other = (
+        Score(jnp.float32(x), jnp.float32(0), *map(jnp.int32, (80, agree, 0)))
+        for x, agree in zip(shares, (0, 20), strict=True)
+    )
+    expected = min(np.sqrt(shares[0] * shares[1]), 2 * min(shares)) * 80 / 100
+    assert float(mutual_overlap(one, other)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_masked_points_are_in_no_share_and_have_no_weight():
+    cloud, target = _cloud(_floor(0.01), UP), _cloud(_floor(0), UP)
+    mask = jnp.arange(256) < 100
+    cloud = PointCloud(cloud.points, cloud.normals, mask)
+    problem = _problem(cloud, target)
+    found = score(problem, EYE, jnp.float32(SPACING))
+    assert int(found.num_inliers) == 100
+    assert float(found.fitness) == 1
+    assert float(found.inlier_rmse) == pytest.approx(0.01, rel=1e-3)
+    agreement = match(problem, EYE).agreement
+    np.testing.assert_allclose(agreement, np.where(mask, 1, 0), atol=1e-5)
+
+
 def _slips(points: np.ndarray, normals: np.ndarray) -> bool:
     cloud = _cloud(points, normals)
     return bool(can_slip(_problem(cloud, cloud), EYE, jnp.float32(SPACING)))
