@@ -110,16 +110,13 @@ def test_ancestors_are_all_frames_above(seed, num):
 
 
 def test_weights_below_a_thousandth_of_the_largest_count_as_that():
-    # Two steps of lengths 1 and 900, or one of 850; then one of 5000, or two of 600.
-    T = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
-    T[:, 0, 3] = [1, 1, 10]
-    edges = jnp.array([[0, 1], [1, 2], [0, 2]], jnp.int32)
-    for length, expected in (([1, 900, 850], 10), ([600, 600, 5000], 10)):
-        weight = 1 / np.array([*length], np.float32)
-        some = np.append(weight, 1).astype(np.float32)  # another edge is the largest
-        T_all = np.concatenate([T, T[:1]])
-        ends = jnp.concatenate([edges, jnp.array([[0, 3]], jnp.int32)])
-        found = shortest(ends, jnp.asarray(T_all), jnp.asarray(some), 4, 0)
+    edges = jnp.array([[0, 1], [1, 2], [0, 2], [0, 3]], jnp.int32)
+    T = np.tile(np.eye(4, dtype=np.float32), (4, 1, 1))
+    T[:3, 0, 3] = [1, 1, 10]
+    # 301 by two steps against 900 by one; then 1200 against 5000, which counts as 1000.
+    for length, expected in (((1, 300, 900, 1), 2), ((600, 600, 5000, 1), 10)):
+        weight = 1 / np.array(length, np.float32)
+        found = shortest(edges, jnp.asarray(T), jnp.asarray(weight), 4, 0)
         np.testing.assert_allclose(found.T_root_i[2, 0, 3], expected)
 
 

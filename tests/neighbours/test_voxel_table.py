@@ -11,6 +11,7 @@ from hypothesis import given
 from scipy.spatial import KDTree
 
 from jaxreg.neighbours import VoxelTable
+from jaxreg.neighbours.feature_transform import feature_transform
 
 
 RESOLUTION = 16
@@ -135,6 +136,30 @@ def test_queries_outside_are_answered_from_the_nearest_cell(candidates):
     listed = np.asarray(table.table).reshape(-1, candidates)[number]
     assert np.all(np.any(listed == np.asarray(found.index)[:, None], axis=1))
     assert np.max(mine - true.min(1)) < np.sqrt(3) * 1.3
+
+
+def test_the_grid_reaches_a_margin_beyond_the_longest_side_on_every_side():
+    target, mask, _ = clouds("random", 0, 2)
+    target = target * np.float32([3, 1])
+    table = VoxelTable.build(jnp.asarray(target), jnp.asarray(mask), resolution=8,
+                             margin=0.25)  # fmt: skip
+    low, high = target[mask].min(0), target[mask].max(0)
+    side = 1.5 * (high - low)[0]
+    np.testing.assert_allclose(table.cell, side / 8, rtol=1e-5)
+    np.testing.assert_allclose(table.origin, (low + high - side) / 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("k", [1, 3])
+def test_of_many_points_in_a_cell_those_nearest_its_centre_are_candidates(k):
+    rng = np.random.default_rng(0)
+    points = (8 * rng.random((3000, 2))).astype(np.float32)
+    mask = rng.random(3000) < 0.8
+    find = jax.jit(feature_transform, static_argnums=(2, 3))
+    rows = np.asarray(find(jnp.asarray(points), jnp.asarray(mask), 8, k))
+    centre = np.stack(np.meshgrid(*[np.arange(8) + 0.5] * 2, indexing="ij"), -1)
+    around = distances(points, mask, centre.reshape(-1, 2))
+    found = np.take_along_axis(around, rows.T, 1)
+    np.testing.assert_allclose(found, np.sort(around, axis=1)[:, :k], rtol=1e-4)
 
 
 def test_options_out_of_range_are_refused():
