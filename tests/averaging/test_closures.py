@@ -1,6 +1,8 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxreg.averaging.start import closures
 from jaxreg.graph import PoseGraph
@@ -10,6 +12,7 @@ from tests.averaging.graphs import motions, rotations
 LAP, NUM = 40, 80
 # Compiled once: all graphs have the same number of edges.
 without_lone_closures = eqx.filter_jit(closures.without_lone_closures)
+confirmed = eqx.filter_jit(closures.confirmed)
 
 
 def two_laps(closures: np.ndarray, wrong: np.ndarray):
@@ -49,6 +52,45 @@ def test_a_lone_closure_among_confirmed_ones_is_doubted():
     weight = np.asarray(without_lone_closures(graph).weight)
     np.testing.assert_array_equal(weight[~wrong], 2)
     np.testing.assert_array_equal(weight[wrong], 0)
+
+
+def _agree(first: tuple[int, int], second: tuple[int, int], apart: float) -> np.ndarray:
+    """Which of two false closures are confirmed that ask for motions so far apart."""
+    angle = 2 * np.pi * np.arange(NUM) / LAP
+    R = Rotation.from_euler("z", angle[:, None]).as_matrix()
+    X = motions(R, np.stack([np.sin(angle), 1 - np.cos(angle), 0.1 * angle], axis=1))
+    X = np.linalg.inv(X[0]) @ X
+    chain = np.stack([np.arange(NUM - 1), np.arange(1, NUM)], axis=1)
+    edges = np.concatenate([chain, [first], [second]])
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]]
+    # A gap between the chained places of both ends.
+    for e, gap in ((-2, 0.7), (-1, 0.7 + apart)):
+        i, j = np.sort(edges[e])
+        turned = motions(np.eye(3)[None], np.array([[gap, 0.3, 0.2]]))[0]
+        T[e] = np.linalg.inv(X[i]) @ turned @ X[j]
+        if edges[e, 0] > edges[e, 1]:
+            T[e] = np.linalg.inv(T[e])
+    graph = PoseGraph.from_edges(edges, T.astype(np.float32), NUM)
+    closure = jnp.arange(len(edges)) >= len(chain)
+    found = np.asarray(confirmed(graph, closure))
+    assert not found[: len(chain)].any()
+    return found[len(chain) :]
+
+
+@pytest.mark.parametrize(
+    ("second", "apart", "expected"),
+    [
+        ((14, 66), 0.0, True),
+        ((66, 14), 0.0, True),
+        ((14, 66), 1.0, False),  # asks for another motion
+        ((14, 69), 0.0, False),  # ends too far away
+        ((18, 62), 0.0, False),
+    ],
+)
+def test_a_closure_is_confirmed_by_one_beside_it_that_asks_for_the_same(
+    second, apart, expected
+):
+    np.testing.assert_array_equal(_agree((9, 60), second, apart), expected)
 
 
 def test_a_frame_is_not_lost_with_its_lone_closure():

@@ -7,6 +7,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import MotionAveraging, average, pose_covariances
+from jaxreg.averaging.base import length_scale
 from jaxreg.averaging.covariance import COVARIANCE_LIMIT
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import motions, random_graph, rotations
@@ -55,6 +56,16 @@ def test_edges_in_any_order_twice_and_both_ways_count_as_measurements():
             balance[i] -= turn
             balance[j] += turn
         np.testing.assert_allclose(balance[1:], 0, atol=1e-7)
+
+
+def test_the_length_scale_is_the_mean_of_the_middle_half():
+    rng = np.random.default_rng(0)
+    T = np.tile(np.eye(4), (41, 1, 1))
+    T[:, :3, 3] = rng.standard_normal((41, 3)) * 10 ** rng.uniform(-1, 3, (41, 1))
+    edges = np.stack([np.arange(41), np.arange(1, 42)], axis=1)
+    graph = PoseGraph.from_edges(edges, T.astype(np.float32)).padded(60)
+    length = np.sort(np.linalg.norm(T[:, :3, 3], axis=1))
+    np.testing.assert_allclose(length_scale(graph), length[10:31].mean(), rtol=1e-5)
 
 
 def test_frames_that_no_edge_names_are_not_placed():

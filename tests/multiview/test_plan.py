@@ -43,6 +43,17 @@ def test_parts_are_joined_by_pairs_that_were_not_tried():
     assert not tried[pairs[:, 0], pairs[:, 1]].any()
 
 
+def test_a_scan_that_hangs_by_a_thread_gets_the_pair_that_overlaps_most():
+    trusted = _symmetric(6, np.concatenate([all_pairs(5), [[0, 5]]]))
+    likely = np.zeros((6, 6))
+    likely[5, 1:5] = likely[1:5, 5] = [0.3, 0.6, 0.1, 0.4]
+    pairs = next_pairs(trusted, trusted, likely, np.zeros(6, int), RNG)
+    assert pairs.tolist() == [[2, 5]]
+    likely[2, 5] = likely[5, 2] = likely[1, 5] = likely[5, 1] = 0.19  # unlikely
+    pairs = next_pairs(trusted, trusted, likely, np.zeros(6, int), RNG)
+    assert pairs.tolist() == [[4, 5]]
+
+
 def test_a_loop_is_closed_where_the_poses_say_that_scans_overlap():
     chain = np.stack([np.arange(9), np.arange(1, 10)], axis=1)
     near = np.stack([np.arange(8), np.arange(2, 10)], axis=1)

@@ -1,20 +1,23 @@
 """Weights of modes, and when one of them rivals the first."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from jaxreg.particle.conclude import _has_rival, _weights
+from jaxreg.cloud import PointCloud
+from jaxreg.neighbours import BruteForce
+from jaxreg.particle.conclude import Pair, _has_rival, _weights
 
 
-def _pair(num_source: int, num_target: int) -> Any:
-    masks = (jnp.arange(400) < num for num in (num_source, num_target))
-    source, target = (SimpleNamespace(mask=mask) for mask in masks)
-    return SimpleNamespace(source=source, target=target)
+def _pair(num_source: int, num_target: int) -> Pair:
+    points = jnp.zeros((400, 3))
+    source, target = (
+        PointCloud(points, points, jnp.arange(400) < num)
+        for num in (num_source, num_target)
+    )
+    indexes = (BruteForce.build(x.points, x.mask) for x in (source, target))
+    return Pair(source, target, *indexes)
 
 
 @pytest.mark.parametrize("sizes", [(300, 200), (200, 400)])
