@@ -135,6 +135,11 @@ def test_unit_and_place_of_the_input_do_not_matter():
     np.testing.assert_allclose(
         in_mm.modes.inlier_rmse / 1000, sol.modes.inlier_rmse, rtol=0.05, atol=1e-5
     )
+    assert sol.trace is not None
+    assert in_mm.trace is not None
+    np.testing.assert_allclose(
+        in_mm.trace.kernel_width / 1000, sol.trace.kernel_width, rtol=0.05
+    )
     far = jr.register(source + np.float32(100), target, FILTER, key=key)
     R = far.T_target_source[:3, :3]
     assert pose_error(R, T[:3, :3])[0] < 0.03

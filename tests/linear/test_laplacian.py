@@ -7,7 +7,8 @@ from scipy.sparse.linalg import spsolve
 
 from jaxreg.linear.krylov import conjugate_gradients
 from jaxreg.linear.laplacian import DENSE_LIMIT, solve_flow, solve_laplacian
-from jaxreg.linear.multigrid import Laplacian, _coarser, anchored, multigrid
+from jaxreg.linear.multigrid import _coarser, multigrid
+from jaxreg.linear.operator import GraphLaplacian
 
 
 solve = jax.jit(solve_flow, static_argnums=3)
@@ -110,10 +111,10 @@ def dense(edges: np.ndarray, weight: np.ndarray, num: int) -> np.ndarray:
     return L
 
 
-def _formed(matrix: Laplacian) -> np.ndarray:
+def _formed(matrix: GraphLaplacian) -> np.ndarray:
     """Applied to all unit vectors."""
     num = matrix.own.shape[0]
-    return np.asarray(matrix(jnp.eye(num, dtype=matrix.own.dtype)[:, None]))[:, 0]
+    return np.asarray(matrix.mv(jnp.eye(num, dtype=matrix.own.dtype)[:, None]))[:, 0]
 
 
 def test_a_coarser_level_is_about_as_stiff_as_frames_that_move_as_one():
@@ -123,7 +124,9 @@ def test_a_coarser_level_is_about_as_stiff_as_frames_that_move_as_one():
     edges = np.stack([i, (i + rng.integers(1, num, 4000)) % num], axis=1)
     weight = 10 ** rng.uniform(-3, 0, 4000)
     with jax.enable_x64(True):
-        matrix = anchored(jnp.asarray(edges), jnp.asarray(weight)[:, None, None], num)
+        matrix = GraphLaplacian.anchored(
+            jnp.asarray(edges), jnp.asarray(weight)[:, None, None], num
+        )
         np.testing.assert_allclose(
             _formed(matrix), dense(edges, weight, num) + np.diag(matrix.own[:, 0, 0])
         )
@@ -142,7 +145,9 @@ def test_a_coarser_level_is_about_as_stiff_as_frames_that_move_as_one():
 
 def test_cycles_leave_little_to_the_search():
     edges, weight, flow = system(3000, 0, 2.0)
-    matrix = anchored(jnp.asarray(edges), jnp.float32(weight)[:, None, None], 3000)
+    matrix = GraphLaplacian.anchored(
+        jnp.asarray(edges), jnp.float32(weight)[:, None, None], 3000
+    )
     rhs = np.zeros((3000, 1, 1), np.float32)
     np.add.at(rhs[:, 0, 0], edges[:, 1], flow[:, 0])
     np.add.at(rhs[:, 0, 0], edges[:, 0], -flow[:, 0])
@@ -150,9 +155,11 @@ def test_cycles_leave_little_to_the_search():
     @jax.jit
     def rounds(matrix, rhs):
         inverse = multigrid(matrix)
-        return conjugate_gradients(matrix, inverse, rhs, tolerance=1e-3, max_steps=200)
+        return conjugate_gradients(
+            matrix.mv, inverse, rhs, tolerance=1e-3, max_steps=200
+        )
 
     x, num = rounds(matrix, jnp.asarray(rhs))
-    left = matrix(x) - rhs
+    left = matrix.mv(x) - rhs
     assert np.linalg.norm(left) < 1e-2 * np.linalg.norm(rhs)
     assert int(num) <= 30

@@ -201,6 +201,20 @@ def test_closed_form_refuses_a_residual_that_it_does_not_solve():
             jax.eval_shape(ClosedForm(), T, found, weight, residual)
 
 
+@in_2d_and_3d
+def test_the_radius_of_gyration_is_that_of_the_moments_of_inertia(d):
+    problem, T, weight = noisy_problem(d, np.float32)
+    found = found_at(problem, T)
+    x, w = np.asarray(found.rotated, float), np.asarray(weight, float)
+    spread = np.einsum("n,in,jn->ij", w, x, x) / w.sum()
+    inertia = np.trace(spread) * np.eye(3 if d == 3 else 1)
+    if d == 3:
+        inertia -= spread
+    expected = np.sqrt(np.mean(np.diag(inertia)))
+    radius = gyration_radius(found, weight)
+    np.testing.assert_allclose(radius, expected, rtol=1e-5)
+
+
 def test_condition_tells_what_the_data_leave_free():
     problem, _, weight = noisy_problem(3, np.float32)
     T = jnp.eye(4, dtype=jnp.float32)

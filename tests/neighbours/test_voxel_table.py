@@ -140,7 +140,7 @@ def test_queries_outside_are_answered_from_the_nearest_cell(candidates):
 
 def test_the_grid_reaches_a_margin_beyond_the_longest_side_on_every_side():
     target, mask, _ = clouds("random", 0, 2)
-    target = target * np.float32([3, 1])
+    target = target * np.array([3, 1], np.float32)
     table = VoxelTable.build(jnp.asarray(target), jnp.asarray(mask), resolution=8,
                              margin=0.25)  # fmt: skip
     low, high = target[mask].min(0), target[mask].max(0)

@@ -1,0 +1,23 @@
+"""Poses between the frames of the input and those of the methods."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import motion
+
+from jaxreg.registrar.frames import Frames
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_pose_moves_centred_points_as_it_moves_the_points(d):
+    rng = np.random.default_rng(d)
+    means, radius, T = 5 * rng.standard_normal((2, d)), 3.0, motion(d, d, shift=4.0)
+    frames = Frames(*map(jnp.float32, (*means, radius)))
+    assert frames.d == d
+    inside = frames.enter(jnp.asarray(T, jnp.float32))
+    points = means[0] + rng.standard_normal((9, d))
+    moved = points @ T[:d, :d].T + T[:d, d]
+    centred = (points - means[0]) / radius
+    found = centred @ np.asarray(inside)[:d, :d].T + np.asarray(inside)[:d, d]
+    np.testing.assert_allclose(found, (moved - means[1]) / radius, atol=1e-5)
+    np.testing.assert_allclose(frames.leave(inside), T, atol=1e-5)
