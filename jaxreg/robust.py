@@ -22,12 +22,14 @@ Widths of zero and residuals of zero are safe: weights are finite, nothing is Na
 """
 
 import abc
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.brief import BriefModule
+from jaxreg._core.checks import check_shares
 from jaxreg._core.quantile import masked_quantile
 
 
@@ -37,6 +39,8 @@ Width = Float[Array, ""]
 
 class AbstractKernel(BriefModule):
     """A robust loss of a residual norm, given squared."""
+
+    described: ClassVar[str] = "a kernel such as Huber()"
 
     @abc.abstractmethod
     def rho(self, sq_residual: Values, width: Width) -> Values:
@@ -235,6 +239,10 @@ class Trimmed(AbstractKernel):
     """
 
     share: Array | float = traced(0.7)
+
+    def __check_init__(self) -> None:
+        """Refuses what is no share."""
+        check_shares(self, "share")
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """min(r^2, width^2) / 2."""

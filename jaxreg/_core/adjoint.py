@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -16,6 +16,8 @@ Tree = TypeVar("Tree")
 
 class AbstractAdjoint(eqx.Module):
     """How a method is differentiated; the answer itself is the same."""
+
+    described: ClassVar[str] = "an adjoint such as ImplicitAdjoint()"
 
     @abc.abstractmethod
     def inputs(self, tree: Tree) -> Tree:

@@ -1,6 +1,7 @@
 """Checks of arguments while tracing: they raise and name what was found and wanted."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -123,3 +124,87 @@ def check_key(key: Key | None, name: str = "key") -> Key:
         f"{name}: wanted jax.random.key(seed), found an array of dtype {key.dtype} "
         f"and shape {key.shape}."
     )
+
+
+def check_instance(found: object, name: str, contract: Any) -> None:
+    """Requires a part or a method that follows a contract.
+
+    Args:
+        found: what the user gave.
+        name: how error messages call it.
+        contract: an abstract class, whose `described` says what is wanted, such as "a
+            kernel such as Huber()"; or its union with None.
+    """
+    if isinstance(found, contract):
+        return
+    optional = get_args(contract)
+    kind = optional[0] if optional else contract
+    wanted = kind.described + (", or None" if optional else "")
+    raise TypeError(f"{name}: wanted {wanted}, found {told(found, kind)}.")
+
+
+def told(found: object, contract: type) -> str:
+    """What was found where an instance of `contract` was wanted, for a message."""
+    if isinstance(found, type):
+        add = "; add ()" if issubclass(found, contract) else ""
+        return f"the class {found.__name__}{add}"
+    short = isinstance(found, (str, int, float, type(None)))
+    return repr(found) if short else f"an object of {type(found).__name__}"
+
+
+def check_parts(method: object, **contracts: Any) -> None:
+    """Requires that the fields so named follow their contracts."""
+    for name, contract in contracts.items():
+        full = f"{type(method).__name__}: {name}"
+        check_instance(getattr(method, name), full, contract)
+
+
+def check_counts(method: object, **least: int) -> None:
+    """Requires integers, given with their least values."""
+    for name, low in least.items():
+        check_count(getattr(method, name), f"{type(method).__name__}: {name}", low)
+
+
+def check_count(found: object, name: str, least: int = 1) -> None:
+    """Requires an integer of at least so much."""
+    wanted = f"{name}: wanted an integer of at least {least}"
+    if isinstance(found, bool) or not isinstance(found, (int, np.integer)):
+        raise TypeError(f"{wanted}, found {found!r}.")
+    if found < least:
+        raise ValueError(f"{wanted}, found {found}.")
+
+
+def check_positive(method: object, *names: str) -> None:
+    """Requires numbers above zero; those that are traced are not looked at."""
+    _check_numbers(method, names, lambda x: x > 0, "a positive number")
+
+
+def check_not_negative(method: object, *names: str) -> None:
+    """Requires numbers of at least zero; those that are traced are not looked at."""
+    _check_numbers(method, names, lambda x: x >= 0, "a number of at least 0")
+
+
+def check_shares(method: object, *names: str) -> None:
+    """Requires numbers above zero, one at most; traced ones are not looked at."""
+    _check_numbers(
+        method, names, lambda x: (x > 0) & (x <= 1), "a number above 0, at most 1"
+    )
+
+
+def _check_numbers(
+    method: object,
+    names: tuple[str, ...],
+    fits: Callable[[np.ndarray], np.ndarray],
+    wanted: str,
+) -> None:
+    for name in names:
+        found = getattr(method, name)
+        if not is_concrete(found):
+            continue
+        told = f"{type(method).__name__}: {name}: wanted {wanted}, found"
+        values = np.asarray(found)
+        if values.dtype.kind not in "iuf":
+            raise TypeError(f"{told} {found!r}.")
+        # Negated: what is not a number does not fit.
+        if not np.all(fits(values)):
+            raise ValueError(f"{told} {values.tolist()}.")

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import overload
 
+from jaxreg._core.checks import check_count, check_instance, check_key
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
@@ -80,8 +81,8 @@ def average(
         MAX_STEPS: the steps ran out.
 
     Raises:
-        TypeError: if `graph` is no PoseGraph, or one of a list of another dtype, or
-            `method` no averaging method.
+        TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,
+            `method` no averaging method, or `key` no key.
         ValueError: if `init` has another shape than the poses, or the graphs of a list
             differ in dimension or in whether they have information.
 
@@ -93,12 +94,9 @@ def average(
     search, whose draws depend on the number of edges.
     """
     method = Correntropy() if method is None else method
-    if not isinstance(method, AbstractAverager):
-        raise TypeError(
-            f"method: wanted an averaging method, found {type(method).__name__}."
-        )
-    if batch_size < 1:
-        raise ValueError(f"batch_size: wanted at least 1, found {batch_size}.")
+    check_instance(method, "method", AbstractAverager)
+    check_count(batch_size, "batch_size")
+    key = None if key is None else check_key(key)
     if isinstance(graph, list | tuple):
         return average_list(graph, method, init, key, batch_size, progress)
     one = check_graph(graph, "graph")

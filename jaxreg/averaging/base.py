@@ -1,6 +1,7 @@
 """The contract of every averaging method, and its solution."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -74,6 +75,8 @@ class AbstractAverager(BriefModule):
     what frame 0 reaches, and fixed the gauge: they leave frame 0 at the identity, and
     edges outside the component of frame 0 have weight 0.
     """
+
+    described: ClassVar[str] = "an averaging method such as Correntropy()"
 
     @abc.abstractmethod
     def solve(

@@ -3,12 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import cast_floats, traced
-from jaxreg._core.checks import is_concrete
+from jaxreg._core.checks import check_counts, check_not_negative, check_positive
 from jaxreg._core.loop import iterate
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points
@@ -83,19 +82,10 @@ class KernelCorrelation(AbstractRegistrar):
 
     def __check_init__(self) -> None:
         """Refuses counts and widths that leave nothing to do."""
-        for name in ("max_steps", "max_points"):
-            if getattr(self, name) < 1:
-                raise ValueError(
-                    f"KernelCorrelation: {name} must be at least 1, found "
-                    f"{getattr(self, name)}."
-                )
-        if self.bandwidth is None or not is_concrete(self.bandwidth):
-            return
-        if not np.all(np.asarray(self.bandwidth) > 0):
-            raise ValueError(
-                "KernelCorrelation: bandwidth must be positive, or None, found "
-                f"{self.bandwidth}."
-            )
+        check_counts(self, max_steps=1, max_points=1)
+        check_not_negative(self, "tolerance")
+        if self.bandwidth is not None:
+            check_positive(self, "bandwidth")
 
     def in_frames(self, frames: Frames) -> "KernelCorrelation":
         """With the bandwidth in radii."""

@@ -13,6 +13,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.adjoint import AbstractAdjoint, ImplicitAdjoint
 from jaxreg._core.arrays import cast_floats, spread_rows, traced
+from jaxreg._core.checks import (
+    check_counts,
+    check_not_negative,
+    check_parts,
+    check_positive,
+)
 from jaxreg._core.loop import iterate
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
@@ -102,12 +108,25 @@ class ICP(AbstractRegistrar):
     adjoint: AbstractAdjoint = ImplicitAdjoint()
 
     def __check_init__(self) -> None:
-        """Refuses counts that leave nothing to do."""
-        for name in ("max_steps", "max_points"):
-            if getattr(self, name) < 1:
-                raise ValueError(
-                    f"ICP: {name} must be at least 1, found {getattr(self, name)}."
-                )
+        """Refuses parts, counts and numbers that it cannot use."""
+        check_parts(
+            self,
+            residual=AbstractResidual,
+            kernel=AbstractKernel,
+            step=AbstractStep,
+            adjoint=AbstractAdjoint,
+        )
+        kind = self.index
+        if not (
+            kind is None or (isinstance(kind, type) and issubclass(kind, AbstractIndex))
+        ):
+            raise TypeError(
+                "ICP: index: wanted the class of an index such as BruteForce, or None, "
+                f"found {kind!r}."
+            )
+        check_counts(self, max_steps=1, max_points=1)
+        check_positive(self, "max_correspondence_distance", "width_end")
+        check_not_negative(self, "tolerance")
 
     def in_frames(self, frames: Frames) -> "ICP":
         """With the correspondence distance in radii."""

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxreg._core.checks import check_key, is_concrete
+from jaxreg._core.checks import check_instance, check_key, is_concrete, told
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
@@ -93,8 +93,9 @@ def reconstruct(
     method = ParticleFilter() if method is None else method
     if not isinstance(method, ParticleFilter):
         raise TypeError(
-            f"method: wanted a ParticleFilter, found {type(method).__name__}."
+            f"method: wanted a ParticleFilter, found {told(method, ParticleFilter)}."
         )
+    check_instance(averaging, "averaging", AbstractAverager | None)
     if hold_previous and not isinstance(previous, ReconstructionSolution):
         raise ValueError(
             "hold_previous: wanted a ReconstructionSolution as previous, found "

@@ -11,13 +11,20 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import cast_floats, on_both
-from jaxreg._core.checks import check_key, is_concrete
+from jaxreg._core.checks import (
+    check_counts,
+    check_key,
+    check_not_negative,
+    check_parts,
+    check_positive,
+)
 from jaxreg._core.typing import Key, Mask, Motion, Points
 from jaxreg.cloud import PointCloud, levelled, thin, without_noise
 from jaxreg.local import AbstractStep, LocalOptimiser
 from jaxreg.matching import AbstractResidual, Problem
 from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
 from jaxreg.particle.conclude import Pair, conclude
+from jaxreg.particle.energies import AbstractEnergy
 from jaxreg.particle.priors import AbstractPrior, GaussianPrior, UniformPrior
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import (
@@ -55,17 +62,34 @@ class AbstractSearch(AbstractRegistrar):
     """A registration method that needs no initial guess: many poses, few points."""
 
     prior: eqx.AbstractVar[AbstractPrior | None]
+    energy: eqx.AbstractVar[AbstractEnergy]
     residual: eqx.AbstractVar[AbstractResidual]
     kernel: eqx.AbstractVar[AbstractKernel]
     step: eqx.AbstractVar[AbstractStep]
     width_start: eqx.AbstractVar[Array | float]
     width_end: eqx.AbstractVar[Array | float]
+    tolerance: eqx.AbstractVar[Array | float]
     min_overlap: eqx.AbstractVar[Array | float]
     num_points: eqx.AbstractVar[int]
     num_modes: eqx.AbstractVar[int]
     refine_steps: eqx.AbstractVar[int]
     max_points: eqx.AbstractVar[int]
     batch_size: eqx.AbstractVar[int]
+
+    def __check_init__(self) -> None:
+        """Refuses parts, counts and numbers that no search can use."""
+        check_parts(
+            self,
+            prior=AbstractPrior | None,
+            residual=AbstractResidual,
+            kernel=AbstractKernel,
+            step=AbstractStep,
+            energy=AbstractEnergy,
+        )
+        check_counts(self, num_points=1, num_modes=1, max_points=1, batch_size=1)
+        check_counts(self, refine_steps=0)
+        check_positive(self, "width_start", "width_end")
+        check_not_negative(self, "tolerance", "min_overlap")
 
     @abc.abstractmethod
     def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
@@ -148,28 +172,6 @@ class AbstractSearch(AbstractRegistrar):
         batch = min(self.batch_size, num)
         surplus = -num % batch
         return jnp.concatenate([T, T[:surplus]]) if surplus else T
-
-
-def check_counts(method: eqx.Module, least: dict[str, int]) -> None:
-    """Requires counts, given with their least values."""
-    for name, low in least.items():
-        found = getattr(method, name)
-        if isinstance(found, bool) or not isinstance(found, int) or found < low:
-            raise ValueError(
-                f"{type(method).__name__}: {name} must be an integer of at least "
-                f"{low}, found {found!r}."
-            )
-
-
-def check_positive(method: eqx.Module, names: tuple[str, ...]) -> None:
-    """Requires positive numbers, where their values are known."""
-    for name in names:
-        value = getattr(method, name)
-        if is_concrete(value) and not float(value) > 0:
-            raise ValueError(
-                f"{type(method).__name__}: {name} must be positive, found "
-                f"{float(value)}."
-            )
 
 
 def _some_points(key: Key, problem: Problem, num: int) -> Problem:

@@ -25,11 +25,16 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
-from jaxreg._core.checks import is_concrete
+from jaxreg._core.checks import (
+    check_counts,
+    check_not_negative,
+    check_parts,
+    check_shares,
+)
 from jaxreg._core.typing import Key, Motion, Scalar
 from jaxreg.local import AbstractStep, GaussNewton, LocalOptimiser
 from jaxreg.matching import AbstractResidual, PointToPlane, Problem
-from jaxreg.particle.base import AbstractSearch, Found, check_counts, check_positive
+from jaxreg.particle.base import AbstractSearch, Found
 from jaxreg.particle.draw import (
     SETTLE_STEPS,
     Drawn,
@@ -130,21 +135,16 @@ class ParticleFilter(AbstractSearch):
 
     def __check_init__(self) -> None:
         """Refuses counts that leave nothing to do."""
-        names = "num_prior num_times prior_steps inner_steps num_points max_points"
-        least = dict.fromkeys([*names.split(), "num_modes", "batch_size"], 1)
-        may_be_zero = {"refine_steps": 0, "num_agreeing": 0}
-        check_counts(self, {**least, "num_particles": 2, **may_be_zero})
+        check_parts(self, dynamics=AbstractDynamics, resampler=AbstractResampler)
+        check_counts(self, num_prior=1, num_times=1, prior_steps=1, inner_steps=1)
+        check_counts(self, num_particles=2, num_agreeing=0)
         if self.num_particles > self.num_prior:
             raise ValueError(
-                "ParticleFilter: num_particles must be from 2 to num_prior = "
+                "ParticleFilter: num_particles: wanted from 2 to num_prior = "
                 f"{self.num_prior}, found {self.num_particles}."
             )
-        check_positive(self, ("sample_share", "width_start", "width_end"))
-        if is_concrete(self.sample_share) and float(self.sample_share) > 1:
-            raise ValueError(
-                "ParticleFilter: sample_share must be at most 1, found "
-                f"{float(self.sample_share)}."
-            )
+        check_shares(self, "sample_share")
+        check_not_negative(self, "prior_error_share")
         if isinstance(self.prior, GivenParticles):
             self.prior.check_number(self.num_prior, "num_prior")
 

@@ -7,10 +7,11 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_counts
 from jaxreg._core.typing import Key, Motion
 from jaxreg.local import AbstractStep, GaussNewton, decoupled_error
 from jaxreg.matching import AbstractResidual, PointToPlane, Problem, match
-from jaxreg.particle.base import AbstractSearch, Found, check_counts, check_positive
+from jaxreg.particle.base import AbstractSearch, Found
 from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy
 from jaxreg.particle.priors import AbstractPrior, GivenParticles
 from jaxreg.particle.state import Particles
@@ -63,9 +64,7 @@ class MultiStart(AbstractSearch):
 
     def __check_init__(self) -> None:
         """Refuses counts that leave nothing to do."""
-        names = "num_starts num_steps num_points num_modes max_points batch_size"
-        check_counts(self, {**dict.fromkeys(names.split(), 1), "refine_steps": 0})
-        check_positive(self, ("width_start", "width_end"))
+        check_counts(self, num_starts=1, num_steps=1)
         if isinstance(self.prior, GivenParticles):
             self.prior.check_number(self.num_starts, "num_starts")
 

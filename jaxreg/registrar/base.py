@@ -1,6 +1,7 @@
 """The contract of registration methods and what they return."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -158,6 +159,8 @@ class AbstractRegistrar(BriefModule):
     `solve` works in frames prepared by `register`: both clouds centred at their
     centroids and scaled so that the target's root mean square radius is one.
     """
+
+    described: ClassVar[str] = "a registration method such as ICP()"
 
     @abc.abstractmethod
     def in_frames(self, frames: Frames) -> "AbstractRegistrar":

@@ -6,6 +6,8 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.checks import (
     as_float_array,
+    check_count,
+    check_instance,
     check_key,
     check_motion,
     check_pair,
@@ -99,13 +101,8 @@ def register(
         arrays of 4 d + 1 bytes a row.
     """
     method = ParticleFilter() if method is None else method
-    if not isinstance(method, AbstractRegistrar):
-        raise TypeError(
-            "method: wanted a registration method such as jaxreg.ParticleFilter() or "
-            f"jaxreg.ICP(), found {type(method).__name__}."
-        )
-    if batch_size < 1:
-        raise ValueError(f"batch_size: wanted at least 1, found {batch_size}.")
+    check_instance(method, "method", AbstractRegistrar)
+    check_count(batch_size, "batch_size")
     key = None if key is None else check_key(key)
     masks = source_mask, target_mask
     if is_list_of_clouds(source) or is_list_of_clouds(target):

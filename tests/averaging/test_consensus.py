@@ -160,7 +160,7 @@ def test_settled_graphs_need_no_hypotheses():
     wild[at, :3, :3] = R.as_matrix()
     solution = average(single(X, edges, wild), CycleConsensus(), key=key)
     assert solution.num_steps > 0
-    with pytest.raises(ValueError, match="hypotheses: wanted at least 1"):
+    with pytest.raises(ValueError, match="hypotheses: wanted an integer of at least 1"):
         CycleConsensus(hypotheses=0)
 
 

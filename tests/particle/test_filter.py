@@ -22,12 +22,14 @@ from jaxreg.particle import (
     AbstractDynamics,
     BoundedEnergy,
     ConstantVelocity,
+    EnsembleSpread,
     GaussianPrior,
     GivenParticles,
     Multinomial,
     MultiStart,
     NoDynamics,
     ParticleFilter,
+    PathSpread,
     Residual,
     SquaredEnergy,
     StochasticDynamics,
@@ -188,7 +190,7 @@ def _paper(d: int, dynamics: AbstractDynamics, num_times: int) -> ParticleFilter
 
 @pytest.mark.parametrize(
     ("d", "dynamics"),
-    [(2, StochasticDynamics(spread="path")), (3, StochasticDynamics())],
+    [(2, StochasticDynamics(spread=PathSpread())), (3, StochasticDynamics())],
 )
 def test_the_papers_filter_solves_an_easy_case(d, dynamics):
     T = motion(4, d, angle=0.6, shift=0.1)
@@ -209,7 +211,7 @@ def test_the_papers_filter_solves_an_easy_case(d, dynamics):
 
 def test_the_filter_stops_when_the_motion_errors_are_small():
     problem = _pair(2).problem
-    method = _paper(2, StochasticDynamics(spread="path"), 12)
+    method = _paper(2, StochasticDynamics(spread=PathSpread()), 12)
     at = eqx.tree_at(lambda m: m.tolerance, method, jnp.asarray(10.0))
     found = _search(at, problem)
     assert int(found.num_steps) == 7 + 7  # t = 0 and t = 1
@@ -315,8 +317,12 @@ def test_as_many_given_particles_as_the_method_starts_with():
     "method",
     [
         _small(prior=None, resampler=Residual(0.5), energy=AbsoluteEnergy()),
-        _small(dynamics=StochasticDynamics(spread="ensemble"), resampler=Stratified()),
-        _small(dynamics=StochasticDynamics(spread="path"), resampler=Multinomial()),
+        _small(
+            dynamics=StochasticDynamics(spread=EnsembleSpread()), resampler=Stratified()
+        ),
+        _small(
+            dynamics=StochasticDynamics(spread=PathSpread()), resampler=Multinomial()
+        ),
         MultiStart(num_starts=P, num_steps=2, refine_steps=0),
         sandhu2010(2, P, ConstantVelocity()),
     ],

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_counts, check_not_negative, check_parts
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -78,6 +79,12 @@ class Correntropy(AbstractAverager):
     max_steps: int = eqx.field(static=True, default=100)
     tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = CycleConsensus()
+
+    def __check_init__(self) -> None:
+        """Refuses parts, counts and numbers that it cannot use."""
+        check_parts(self, initialiser=AbstractAverager)
+        check_counts(self, max_steps=1)
+        check_not_negative(self, "tolerance")
 
     def solve(
         self,

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_counts, check_not_negative, check_positive
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.typing import Key, Scalar
 from jaxreg.averaging.base import (
@@ -53,6 +54,12 @@ class LowRankSparse(AbstractAverager):
     threshold: Array | float = traced(0.05)
     max_steps: int = eqx.field(static=True, default=1000)
     tolerance: Array | float = traced(1e-5)
+
+    def __check_init__(self) -> None:
+        """Refuses counts and numbers that leave nothing to do."""
+        check_counts(self, max_steps=1)
+        check_positive(self, "threshold")
+        check_not_negative(self, "tolerance")
 
     @eqx.filter_jit
     def solve(

@@ -11,6 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import (
+    check_counts,
+    check_not_negative,
+    check_parts,
+    check_positive,
+)
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -59,6 +65,13 @@ class MCC(AbstractAverager):
     max_steps: int = eqx.field(static=True, default=100)
     tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = CycleConsensus()
+
+    def __check_init__(self) -> None:
+        """Refuses parts, counts and numbers that it cannot use."""
+        check_parts(self, rows=AbstractRows, initialiser=AbstractAverager)
+        check_counts(self, max_steps=1)
+        check_positive(self, "alpha")
+        check_not_negative(self, "tolerance")
 
     def solve(
         self,

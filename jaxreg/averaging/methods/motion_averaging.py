@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_counts, check_not_negative, check_parts
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, start
 from jaxreg.averaging.methods.shortest_paths import ShortestPaths
@@ -45,6 +46,12 @@ class MotionAveraging(AbstractAverager):
     tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = ShortestPaths()
 
+    def __check_init__(self) -> None:
+        """Refuses parts, counts and numbers that it cannot use."""
+        check_parts(self, initialiser=AbstractAverager)
+        check_counts(self, max_steps=1)
+        check_not_negative(self, "tolerance")
+
     @eqx.filter_jit
     def solve(
         self,
@@ -75,6 +82,12 @@ class WeightedMotionAveraging(AbstractAverager):
     max_steps: int = eqx.field(static=True, default=50)
     tolerance: Array | float = traced(1e-8)
     initialiser: AbstractAverager = ShortestPaths()
+
+    def __check_init__(self) -> None:
+        """Refuses parts, counts and numbers that it cannot use."""
+        check_parts(self, rows=AbstractRows, initialiser=AbstractAverager)
+        check_counts(self, max_steps=1)
+        check_not_negative(self, "tolerance")
 
     @eqx.filter_jit
     def solve(

@@ -9,6 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import (
+    check_counts,
+    check_not_negative,
+    check_parts,
+    check_positive,
+)
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -62,6 +68,18 @@ class PoseGraphLM(AbstractAverager):
     max_steps: int = eqx.field(static=True, default=50)
     tolerance: Array | float = traced(1e-6)
     initialiser: AbstractAverager = MotionAveraging(max_steps=3)
+
+    def __check_init__(self) -> None:
+        """Refuses parts, counts and numbers that it cannot use."""
+        check_parts(
+            self,
+            error=AbstractEdgeError,
+            kernel=AbstractKernel | None,
+            initialiser=AbstractAverager,
+        )
+        check_counts(self, max_steps=1)
+        check_positive(self, "kernel_width")
+        check_not_negative(self, "tolerance")
 
     @eqx.filter_jit
     def solve(

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg._core.checks import is_concrete
+from jaxreg._core.checks import check_counts, is_concrete
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -67,9 +67,7 @@ class CycleConsensus(AbstractAverager):
     rounds: int = eqx.field(static=True, default=12)
 
     def __check_init__(self) -> None:
-        for name in ("hypotheses", "rounds"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: wanted at least 1.")
+        check_counts(self, hypotheses=1, rounds=1)
 
     def solve(
         self,

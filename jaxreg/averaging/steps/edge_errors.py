@@ -1,6 +1,7 @@
 """How far a predicted motion is from a measured one, with derivatives."""
 
 import abc
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
 
 class AbstractEdgeError(BriefModule):
     """The error of predicted motions, given the measured ones."""
+
+    described: ClassVar[str] = "an error such as LogError()"
 
     @abc.abstractmethod
     def value(

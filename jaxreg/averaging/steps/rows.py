@@ -6,6 +6,7 @@ rows by its root.
 """
 
 import abc
+from typing import ClassVar
 
 from jaxtyping import Array, Float
 
@@ -15,6 +16,8 @@ from jaxreg.graph.pose_graph import PoseGraph
 
 class AbstractRows(BriefModule):
     """What an edge counts in the least squares of a step."""
+
+    described: ClassVar[str] = "rows such as RootRows()"
 
     @abc.abstractmethod
     def squared(

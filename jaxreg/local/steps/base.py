@@ -1,6 +1,7 @@
 """The contract of steps, and the tangent space that they work in."""
 
 import abc
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import lax
@@ -15,6 +16,8 @@ from jaxreg.matching.residuals import AbstractResidual
 
 class AbstractStep(BriefModule):
     """One update of the pose with correspondences and weights held."""
+
+    described: ClassVar[str] = "a step such as GaussNewton()"
 
     @abc.abstractmethod
     def __call__(

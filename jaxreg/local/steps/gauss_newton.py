@@ -3,6 +3,7 @@
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_not_negative
 from jaxreg._core.typing import Motion
 from jaxreg.local.steps.base import AbstractStep, turn_and_shift
 from jaxreg.local.steps.scaling import Scaled
@@ -19,6 +20,10 @@ class GaussNewton(AbstractStep):
     """
 
     damping: Array | float = traced(1e-5)
+
+    def __check_init__(self) -> None:
+        """Refuses negative damping."""
+        check_not_negative(self, "damping")
 
     def __call__(
         self,

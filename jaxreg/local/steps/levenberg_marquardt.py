@@ -6,6 +6,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_counts, check_positive
 from jaxreg._core.typing import Motion
 from jaxreg.local.steps.base import AbstractStep, turn_and_shift
 from jaxreg.local.steps.scaling import Scaled
@@ -39,6 +40,11 @@ class LevenbergMarquardt(AbstractStep):
 
     damping: Array | float = traced(1e-5)
     max_tries: int = eqx.field(default=8, static=True)
+
+    def __check_init__(self) -> None:
+        """Refuses no damping, which cannot be raised, and no try."""
+        check_positive(self, "damping")
+        check_counts(self, max_tries=1)
 
     def __call__(
         self,

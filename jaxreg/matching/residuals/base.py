@@ -24,6 +24,8 @@ class AbstractResidual(BriefModule):
         uses_normals: whether matches also count by the agreement of their normals.
     """
 
+    described: ClassVar[str] = "a residual such as PointToPlane()"
+
     uses_normals: ClassVar[bool]
 
     @abc.abstractmethod

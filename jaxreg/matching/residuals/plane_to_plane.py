@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_positive
 from jaxreg.matching.problem import Match, sum_rows
 from jaxreg.matching.residuals.base import AbstractResidual
 from jaxreg.matching.residuals.gram import along, half_sum, weighted_gram
@@ -35,6 +36,10 @@ class PlaneToPlane(AbstractResidual):
 
     uses_normals: ClassVar[bool] = True
     epsilon: Array | float = traced(1e-3)
+
+    def __check_init__(self) -> None:
+        """Refuses discs without a thickness."""
+        check_positive(self, "epsilon")
 
     def normal_equations(
         self, match: Match, weight: Float[Array, " n"]

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_not_negative
 from jaxreg.matching.problem import Match
 from jaxreg.matching.residuals.base import AbstractResidual
 from jaxreg.matching.residuals.gram import along, half_sum, weighted_gram
@@ -24,6 +25,10 @@ class PointToPlane(AbstractResidual):
 
     uses_normals: ClassVar[bool] = True
     point_share: Array | float = traced(0.05)
+
+    def __check_init__(self) -> None:
+        """Refuses a negative share."""
+        check_not_negative(self, "point_share")
 
     def normal_equations(
         self, match: Match, weight: Float[Array, " n"]

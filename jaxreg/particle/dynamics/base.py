@@ -1,6 +1,7 @@
 """The contract of dynamics."""
 
 import abc
+from typing import ClassVar
 
 from jaxtyping import Array, Float, Int
 
@@ -11,6 +12,8 @@ from jaxreg.particle.state import Particles
 
 class AbstractDynamics(BriefModule):
     """The prediction p(x_t | x_{t-1}, z_{t-1}) (PF paper, section 3.2)."""
+
+    described: ClassVar[str] = "dynamics such as StochasticDynamics()"
 
     @property
     @abc.abstractmethod

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_positive
 from jaxreg._core.typing import Scalar
 from jaxreg.matching import Match
 from jaxreg.particle.energies.base import AbstractEnergy, mean_over_source
@@ -22,6 +23,10 @@ class AbsoluteEnergy(AbstractEnergy):
 
     resolution: ClassVar[float] = 0.0
     epsilon: Array | float = traced(0.01)
+
+    def __check_init__(self) -> None:
+        """Refuses what would leave the corner."""
+        check_positive(self, "epsilon")
 
     def __call__(self, found: Match, width: Scalar) -> Scalar:
         """The smoothed L1 energy."""

@@ -23,6 +23,8 @@ class AbstractEnergy(BriefModule):
             the energy has no scale of its own.
     """
 
+    described: ClassVar[str] = "an energy such as BoundedEnergy()"
+
     resolution: ClassVar[float]
 
     @abc.abstractmethod

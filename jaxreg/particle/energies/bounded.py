@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_not_negative, check_positive
 from jaxreg._core.typing import Scalar
 from jaxreg.matching import Match
 from jaxreg.particle.energies.base import AbstractEnergy
@@ -40,6 +41,11 @@ class BoundedEnergy(AbstractEnergy):
     resolution: ClassVar[float] = 4.0
     slide: Array | float = traced(0.3)
     narrow: Array | float = traced(0.5)
+
+    def __check_init__(self) -> None:
+        """Refuses factors that say nothing."""
+        check_not_negative(self, "slide")
+        check_positive(self, "narrow")
 
     def __call__(self, found: Match, width: Scalar) -> Scalar:
         """The share of the source that has no counterpart or a wrong one, softly."""

@@ -1,18 +1,19 @@
 """The contract of priors."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 from jaxtyping import Array, Float
 
 from jaxreg._core.brief import BriefModule
-from jaxreg._core.checks import is_concrete
 from jaxreg._core.typing import Key, Motion
 from jaxreg.registrar import Frames
 
 
 class AbstractPrior(BriefModule):
     """pi_0: where the particles are at t = 0 (PF paper, section 4.2)."""
+
+    described: ClassVar[str] = "a prior such as UniformPrior()"
 
     @abc.abstractmethod
     def draw(
@@ -34,11 +35,3 @@ class AbstractPrior(BriefModule):
 
         Users give them in the frames of the input. The prior itself if it has none.
         """
-
-
-def check_spread(prior: object, name: str, spread: Array | float) -> None:
-    """Requires a spread that is not negative, where its value is known."""
-    if is_concrete(spread) and not float(spread) >= 0:
-        raise ValueError(
-            f"{type(prior).__name__}: {name} must be at least 0, found {float(spread)}."
-        )

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
-from jaxreg._core.checks import is_concrete
+from jaxreg._core.checks import check_not_negative, is_concrete
 from jaxreg._core.typing import Key, Motion
 from jaxreg.geometry import lie
 from jaxreg.local import turn_and_shift
-from jaxreg.particle.priors.base import AbstractPrior, check_spread
+from jaxreg.particle.priors.base import AbstractPrior
 from jaxreg.registrar import Frames
 
 
@@ -35,8 +35,7 @@ class GaussianPrior(AbstractPrior):
     def __check_init__(self) -> None:
         """Refuses spreads that leave a single pose."""
         both = (self.translation_spread, self.rotation_spread)
-        check_spread(self, "translation_spread", both[0])
-        check_spread(self, "rotation_spread", both[1])
+        check_not_negative(self, "translation_spread", "rotation_spread")
         if all(is_concrete(s) and float(s) == 0 for s in both):
             raise ValueError(
                 "GaussianPrior: translation_spread and rotation_spread are both 0, "

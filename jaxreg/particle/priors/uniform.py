@@ -6,9 +6,10 @@ import jax
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
+from jaxreg._core.checks import check_not_negative
 from jaxreg._core.typing import Key, Motion
 from jaxreg.geometry import lie
-from jaxreg.particle.priors.base import AbstractPrior, check_spread
+from jaxreg.particle.priors.base import AbstractPrior
 from jaxreg.registrar import Frames
 
 
@@ -27,7 +28,7 @@ class UniformPrior(AbstractPrior):
 
     def __check_init__(self) -> None:
         """Refuses a negative spread."""
-        check_spread(self, "translation_spread", self.translation_spread)
+        check_not_negative(self, "translation_spread")
 
     def in_frames(self, frames: Frames) -> "UniformPrior":
         """Itself: it holds no poses."""

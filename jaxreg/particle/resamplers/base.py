@@ -1,13 +1,14 @@
 """The contract of resamplers, and the rule of when to resample."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.brief import BriefModule
-from jaxreg._core.checks import is_concrete
+from jaxreg._core.checks import check_not_negative
 from jaxreg._core.typing import Key
 from jaxreg.particle.weights import effective_sample_size
 
@@ -24,15 +25,13 @@ class AbstractResampler(BriefModule):
     Raises: ValueError for a negative threshold.
     """
 
+    described: ClassVar[str] = "a resampler such as Systematic()"
+
     threshold: eqx.AbstractVar[Array | float]
 
     def __check_init__(self) -> None:
         """Refuses a negative threshold."""
-        if is_concrete(self.threshold) and not float(self.threshold) >= 0:
-            raise ValueError(
-                f"{type(self).__name__}: threshold must be at least 0, found "
-                f"{float(self.threshold)}."
-            )
+        check_not_negative(self, "threshold")
 
     @abc.abstractmethod
     def draw(

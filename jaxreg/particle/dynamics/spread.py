@@ -1,0 +1,83 @@
+"""Over what the expectation of Eq. 7 is taken: the paper leaves it open."""
+
+import abc
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxreg._core.brief import BriefModule
+from jaxreg._core.typing import Key
+from jaxreg.linear.small import eigh
+from jaxreg.particle.state import Particles
+
+
+class AbstractSpread(BriefModule):
+    """S = E[e e^T] of the motion errors e (PF paper, Eq. 6-8)."""
+
+    described: ClassVar[str] = "a spread such as OwnSpread()"
+    #: Whether `Particles.path` has to be kept.
+    needs_path: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def draw(
+        self, key: Key, particles: Particles, time: Int[Array, ""]
+    ) -> Float[Array, "p k"]:
+        """A tangent of N(0, S) for each particle.
+
+        Args:
+            key: randomness.
+            particles: of time - 1, resampled.
+            time: t, the number of motion errors in `particles.path`.
+        """
+
+
+class OwnSpread(AbstractSpread):
+    """S = e e^T of the particle: it diffuses along its own last motion."""
+
+    def draw(
+        self, key: Key, particles: Particles, time: Int[Array, ""]
+    ) -> Float[Array, "p k"]:
+        """The motion error times a normal number."""
+        error = particles.motion_error
+        return jax.random.normal(key, (error.shape[0], 1), error.dtype) * error
+
+
+class EnsembleSpread(AbstractSpread):
+    """S = sum_i w_i e_i e_i^T over the particles, the same for all."""
+
+    def draw(
+        self, key: Key, particles: Particles, time: Int[Array, ""]
+    ) -> Float[Array, "p k"]:
+        """Normal vectors times a root of S."""
+        error = particles.motion_error
+        root = _root_of_covariance(error, jnp.exp(particles.log_weight))
+        return jax.random.normal(key, error.shape, error.dtype) @ root.T
+
+
+class PathSpread(AbstractSpread):
+    """S = the mean of e e^T over the particle's ancestors and itself."""
+
+    needs_path: ClassVar[bool] = True
+
+    def draw(
+        self, key: Key, particles: Particles, time: Int[Array, ""]
+    ) -> Float[Array, "p k"]:
+        """A sum of the path's errors with independent factors: it has that S."""
+        path = particles.path
+        assert path is not None
+        draws = jax.random.normal(key, path.shape[:2], path.dtype)
+        sums = jnp.einsum("pt,ptk->pk", draws, path)
+        return sums / jnp.sqrt(jnp.maximum(time, 1).astype(path.dtype))
+
+
+def _root_of_covariance(
+    error: Float[Array, "p k"], weight: Float[Array, " p"]
+) -> Float[Array, "k k"]:
+    """L with L L^T = sum_i w_i e_i e_i^T; singular where the errors span less."""
+    # Rows out of use have no weight, but may hold errors that are not finite.
+    error = jnp.where((weight > 0)[:, None] & jnp.isfinite(error), error, 0)
+    S = jnp.einsum("p,pi,pj->ij", weight, error, error)
+    value, vector = eigh(S)
+    return vector * jnp.sqrt(jnp.maximum(value, 0))
