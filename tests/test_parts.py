@@ -168,6 +168,8 @@ def test_methods_and_keys_are_checked_when_called():
         words = re.escape(f"method: wanted {wanted}, found the class {method.__name__}")
         with pytest.raises(TypeError, match=words):
             call(method, None)
+        with pytest.raises(TypeError, match=re.escape(f"wanted {wanted}, found 'icp'")):
+            call("icp", None)
         with pytest.raises(TypeError, match=r"key: wanted jax.random.key.*found int"):
             call(method(), 0)
     with pytest.raises(TypeError, match="key: wanted"):

@@ -273,11 +273,6 @@ TWO = {"target": [CUBE] * 2}
         ({"init": np.eye(3)}, ValueError, r"init.*\(\.\.\., 4, 4\)"),
         ({"key": jnp.ones(3)}, TypeError, "key.*float32"),
         ({"key": None}, ValueError, r"key.*jax\.random\.key"),
-        (
-            {"method": "icp"},
-            TypeError,
-            "method: wanted a registration method such as ICP.*'icp'",
-        ),
         ({"batch_size": 0}, ValueError, "batch_size.*at least 1, found 0"),
         ({"source": [CUBE] * 2}, TypeError, "target.*a list"),
         ({"source": [CUBE] * 2, "target": [CUBE]}, ValueError, "length.* 2 and 1"),

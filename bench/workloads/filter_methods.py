@@ -13,6 +13,7 @@ from bench.workloads.filter_data import Trials
 from jaxreg import KernelCorrelation
 from jaxreg.particle import (
     ConstantVelocity,
+    EnsembleSpread,
     GaussianPrior,
     MultiStart,
     NoDynamics,
@@ -89,7 +90,7 @@ _ON_TRUCK = [
     ),
     Tried(
         f"{PAPER}, S of all particles",
-        sandhu2010(3, 100, StochasticDynamics(spread="ensemble"), prior=_TRUCK),
+        sandhu2010(3, 100, StochasticDynamics(spread=EnsembleSpread()), prior=_TRUCK),
     ),
     *_ours(_TRUCK),
     # As many look-ups, spent otherwise.

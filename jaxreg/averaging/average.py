@@ -74,8 +74,9 @@ def average(
             done; not for one graph, not under `jit`.
 
     Returns:
-        An `AveragingSolution`; a list of them for a list. Status DISCONNECTED: some
-        frames are not joined to frame 0 by edges of positive weight, see `placed`.
+        An `AveragingSolution`, with leading axes under `vmap`; for a list a list of
+        them, one for each graph. Status DISCONNECTED: some frames are not joined to
+        frame 0 by edges of positive weight, see `placed`.
         NON_FINITE: edges or poses with NaN or inf were met; such edges are ignored,
         such poses returned as the identity.
         MAX_STEPS: the steps ran out.

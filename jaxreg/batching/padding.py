@@ -1,13 +1,17 @@
 """Point sets of unequal sizes: lists of them, and arrays of few sizes with masks."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from jaxreg._core.checks import as_float_array, check_mask, is_concrete
 
+
+Tree = TypeVar("Tree")
 
 _LEAST = 64
 
@@ -106,3 +110,15 @@ def stacked(arrays: Sequence[Array], num_rows: int) -> Array:
     for i, x in enumerate(arrays):
         out = out.at[i, : len(x)].set(x)
     return out
+
+
+def unstacked(tree: Tree, num: int) -> list[Tree]:
+    """A tree for each of the `num` rows of all arrays of a tree."""
+    if all(map(is_concrete, jax.tree.leaves(tree))):  # so that it compiles nothing
+        host = jax.tree.map(np.asarray, tree)
+        return jax.device_put([_row(host, k) for k in range(num)])
+    return [_row(tree, k) for k in range(num)]
+
+
+def _row(tree: Tree, k: int) -> Tree:
+    return jax.tree.map(lambda x: x[k], tree)

@@ -11,13 +11,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxreg._core.checks import (
-    is_concrete,
-)
+from jaxreg._core.checks import is_concrete
 from jaxreg._core.typing import Progress
 from jaxreg.batching.padding import (
     rounded_up,
     stacked,
+    unstacked,
 )
 from jaxreg.batching.progress import tell
 from jaxreg.batching.threads import map_in_threads, num_cores
@@ -76,8 +75,8 @@ def register_lists(
     key: Array | None,
     batch_size: int,
     progress: Progress | None,
-) -> RegistrationSolution:
-    """Of pairs of unequal sizes, padded."""
+) -> list[RegistrationSolution]:
+    """Of each pair of two lists; they are padded to few sizes."""
     sources, targets, source_masks, target_masks = lists
     data, impl = _split(key, len(sources))
     tell(progress, _STAGE, 0, len(sources), lists, init, data)
@@ -101,7 +100,8 @@ def register_lists(
 
     sizes = np.array([[rounded_up(len(x)) for x in xs] for xs in (sources, targets)])
     groups = [group(*same) for same in _of_similar_size(sizes.T)]
-    return _register_groups(method, groups, impl, threads, batch_size, progress)
+    found = _register_groups(method, groups, impl, threads, batch_size, progress)
+    return unstacked(found, len(sources))
 
 
 def _of_similar_size(sizes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

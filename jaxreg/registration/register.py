@@ -1,7 +1,11 @@
 """`register`: what its users call."""
 
+from collections.abc import Sequence
+from typing import overload
+
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import (
@@ -26,6 +30,23 @@ from jaxreg.registration.many import register_batch, register_lists
 from jaxreg.registration.pair import register_pair
 
 
+# Lists come first: they are objects, too.
+@overload
+def register(  # pyright: ignore[reportOverlappingOverload]
+    source: Sequence[Array | np.ndarray],
+    target: Sequence[Array | np.ndarray],
+    method: AbstractRegistrar | None = None,
+    init: object = None,
+    key: Key | None = None,
+    *,
+    source_mask: object = None,
+    target_mask: object = None,
+    batch_size: int = 1,
+    progress: Progress | None = None,
+) -> list[RegistrationSolution]: ...
+
+
+@overload
 def register(
     source: object,
     target: object,
@@ -37,7 +58,21 @@ def register(
     target_mask: object = None,
     batch_size: int = 1,
     progress: Progress | None = None,
-) -> RegistrationSolution:
+) -> RegistrationSolution: ...
+
+
+def register(
+    source: object,
+    target: object,
+    method: AbstractRegistrar | None = None,
+    init: object = None,
+    key: Key | None = None,
+    *,
+    source_mask: object = None,
+    target_mask: object = None,
+    batch_size: int = 1,
+    progress: Progress | None = None,
+) -> RegistrationSolution | list[RegistrationSolution]:
     """Registers a source point set to a target, or many pairs of them.
 
         >>> import jaxreg as jr
@@ -72,7 +107,8 @@ def register(
             done, on an accelerator all of a size; not for one pair, not under `jit`.
 
     Returns:
-        A `RegistrationSolution`, with leading axes for a batch and one for a list.
+        A `RegistrationSolution`, with leading axes for a batch; for lists a list of
+        them, one for each pair.
 
     Raises:
         ValueError, TypeError: while tracing, for shapes, dtypes and keys that do not
