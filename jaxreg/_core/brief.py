@@ -1,4 +1,8 @@
-"""Modules that say what they are in a line."""
+"""Modules that say what they are in a line.
+
+By hand: wadler_lindig shows every default that a converter has made an array, and
+numbers in arrays by their dtype; its hooks for both would take as many lines.
+"""
 
 import dataclasses
 

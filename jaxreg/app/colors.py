@@ -1,4 +1,7 @@
-"""One colour a scan, the same in every file and figure."""
+"""One colour a scan, the same in every file and figure.
+
+By hand: lists of colours end, and Matplotlib's longest one after twenty.
+"""
 
 import colorsys
 

@@ -1,4 +1,7 @@
-"""Work for all cores: XLA on CPU runs a loop on one."""
+"""Work for all cores: XLA on CPU runs a loop on one.
+
+A pool of the standard library; JAX's own settings of a thread have to be carried.
+"""
 
 import os
 from collections.abc import Callable, Iterator, Sequence

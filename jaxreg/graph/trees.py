@@ -4,6 +4,8 @@ All functions take `edges` and a weight per edge; edges of weight 0 (or NaN) are
 absent. Every loop takes O(e) work a round; the rounds are logarithmic in the number of
 frames, except for `shortest_paths`, whose rounds are the hops of its longest path.
 
+By hand: `scipy.sparse.csgraph` runs on the host, outside `jit` and `vmap`.
+
 Gradients: none; inputs are cut (the topology is not differentiable, and the poses of
 a tree serve as a start).
 """

@@ -1,4 +1,7 @@
-"""Files that appear whole or not at all: write beside the target, then rename."""
+"""Files that appear whole or not at all: write beside the target, then rename.
+
+By hand: packages for single files are no longer kept up, and none does folders.
+"""
 
 import contextlib
 import os

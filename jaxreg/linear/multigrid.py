@@ -9,6 +9,8 @@ it, and pieces of frames that bend apart must not be fixed to each other.
 Pieces that move as one are too stiff by about a constant at each level; two steps of
 conjugate gradients on each find the right lengths (the K-cycle).
 
+By hand: PyAMG runs on the host, where neither `jit` nor new weights reach it.
+
 Reference: Notay, An aggregation-based algebraic multigrid method, ETNA 37, 2010.
 """
 

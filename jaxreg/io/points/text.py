@@ -1,4 +1,8 @@
-"""Point sets as text: XYZ, CSV, TXT in the dialects that scanners and sheets write."""
+"""Point sets as text: XYZ, CSV, TXT in the dialects that scanners and sheets write.
+
+By hand: `numpy.loadtxt` knows neither decimal commas nor empty cells, and says neither
+file nor what to do.
+"""
 
 import re
 from pathlib import Path
