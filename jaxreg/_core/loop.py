@@ -50,13 +50,9 @@ class AbstractIteration(eqx.Module, Generic[Start, State]):
     def terminate(self, state: State) -> Bool[Array, ""]:
         """Whether the answer stands still, whatever the number of steps."""
 
+    @abc.abstractmethod
     def fail(self, state: State) -> Bool[Array, ""]:
-        """Whether further steps are of no use, as after a number that is not finite.
-
-        Most iterations go on.
-        """
-        del state
-        return jnp.asarray(False)
+        """Whether further steps are of no use, as after a number that is not finite."""
 
 
 class Ended(eqx.Module, Generic[State]):

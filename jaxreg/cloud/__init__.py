@@ -1,5 +1,7 @@
 """Point clouds: thinned, described and measured inside `jit`."""
 
+from jaxreg.cloud.frames import Frames as Frames
+from jaxreg.cloud.frames import Side as Side
 from jaxreg.cloud.noise import without_noise as without_noise
 from jaxreg.cloud.point_cloud import PointCloud as PointCloud
 from jaxreg.cloud.point_cloud import centroid as centroid

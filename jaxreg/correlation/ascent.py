@@ -77,6 +77,10 @@ class Ascending(AbstractIteration[Motion, Ascent]):
         """Whether the last step was small."""
         return ~state.moving
 
+    def fail(self, state: Ascent) -> Bool[Array, ""]:
+        """Never: a step that is not a number is small."""
+        return jnp.asarray(False)
+
     def step(self, state: Ascent) -> Ascent:
         """Looks at the trial, keeps the better pose, and tries the next."""
         model = self._model(state.trial)

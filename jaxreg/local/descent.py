@@ -119,6 +119,10 @@ class Descending(AbstractIteration[tuple[Motion, Scalar], Descent]):
         """Whether the last step was small, of all points and at the final width."""
         return ~state.moving
 
+    def fail(self, state: Descent) -> Bool[Array, ""]:
+        """Never: a step that is not a number is small."""
+        return jnp.asarray(False)
+
     def step(self, state: Descent) -> Descent:
         """Matches, weighs, moves."""
         optimiser, limits = self.optimiser, self.limits

@@ -2,7 +2,7 @@
 
 Coordinates of the source are held as rows `(d, n)`, which XLA vectorises over points.
 The source is centred at its own centroid, so that rotation and translation decouple
-(PF paper, section 3.1); see `jaxreg.registration.pair` for the frames around it.
+(PF paper, section 3.1); see `jaxreg.cloud.frames` for the frames around it.
 """
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.cloud import PointCloud, RangeImage
+from jaxreg.cloud import Frames, PointCloud, RangeImage
 from jaxreg.geometry import lie
 from jaxreg.neighbours.base import AbstractIndex
 
@@ -25,6 +25,7 @@ class Problem(eqx.Module):
         target: `(m, 2d)` points and unit normals of either sign, side by side.
         index: closest points among the target.
         seen: what the target's scanner saw, where its viewpoint is known.
+        frames: those of the input, where they are known.
     """
 
     source: Float[Array, "d n"]
@@ -33,10 +34,15 @@ class Problem(eqx.Module):
     target: Float[Array, "m two_d"]
     index: AbstractIndex
     seen: RangeImage | None = None
+    frames: Frames | None = None
 
     @classmethod
     def of(
-        cls, source: PointCloud, target: PointCloud, index: AbstractIndex
+        cls,
+        source: PointCloud,
+        target: PointCloud,
+        index: AbstractIndex,
+        frames: Frames | None = None,
     ) -> "Problem":
         """The problem of two clouds; `index` was built on the target's points."""
         return cls(
@@ -46,6 +52,7 @@ class Problem(eqx.Module):
             jnp.concatenate([target.points, target.normals], axis=1),
             index,
             target.seen,
+            frames,
         )
 
     def of_rows(self, rows: Int[Array, " r"] | slice) -> "Problem":
@@ -57,6 +64,7 @@ class Problem(eqx.Module):
             self.target,
             self.index,
             self.seen,
+            self.frames,
         )
 
     def every(self, step: int) -> "Problem":
@@ -77,6 +85,7 @@ class Problem(eqx.Module):
             self.target,
             self.index,
             self.seen,
+            self.frames,
         )
 
 

@@ -24,4 +24,7 @@ from jaxreg.particle.resamplers import Multinomial as Multinomial
 from jaxreg.particle.resamplers import Residual as Residual
 from jaxreg.particle.resamplers import Stratified as Stratified
 from jaxreg.particle.resamplers import Systematic as Systematic
+from jaxreg.particle.state import ParticleInfo as ParticleInfo
 from jaxreg.particle.state import Particles as Particles
+from jaxreg.particle.state import ParticleState as ParticleState
+from jaxreg.particle.stepping import Filtering as Filtering

@@ -32,6 +32,7 @@ from jaxreg.registrar import (
     Frames,
     RegistrationSolution,
     SearchTrace,
+    prepare_pair,
 )
 from jaxreg.robust import AbstractKernel
 
@@ -93,7 +94,14 @@ class AbstractSearch(AbstractRegistrar):
 
     @abc.abstractmethod
     def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
-        """Searches on the points of the problem."""
+        """Searches on the points of the problem.
+
+        Args:
+            key: randomness.
+            problem: as of `problem`.
+            init: an initial guess between the frames of the input, where the problem
+                knows them (`problem.frames`); else, and in the result, in its own.
+        """
 
     def in_frames(self, frames: Frames) -> "AbstractSearch":
         """With the prior's poses in the frames of `solve`."""
@@ -106,6 +114,15 @@ class AbstractSearch(AbstractRegistrar):
         mask = without_noise(points, mask)
         return thin(points, mask, self.max_points, _NORMAL_NEIGHBOURS)
 
+    def problem(self, pair: tuple[Array, ...], key: Key) -> Problem:
+        """What `search` works on, of a source, a target and their masks; traced."""
+        if pair[0].ndim != 2:
+            raise ValueError(f"source: wanted shape (n, d), found {pair[0].shape}.")
+        ready = prepare_pair(self, lax.stop_gradient(pair))
+        index = self._indexes(ready.source, ready.target)[1]
+        problem = Problem.of(ready.source, ready.target, index, ready.frames)
+        return _some_points(check_key(key), problem, self.num_points)
+
     def solve(
         self,
         source: PointCloud,
@@ -117,15 +134,20 @@ class AbstractSearch(AbstractRegistrar):
         key = check_key(key)
         if key.ndim:
             raise ValueError(f"key: wanted one key, found shape {key.shape}.")
+        indexes = self._indexes(source, target)
+        return self.solve_indexed(source, target, *indexes, init, key)
+
+    def _indexes(
+        self, source: PointCloud, target: PointCloud
+    ) -> tuple[AbstractIndex, AbstractIndex]:
+        """Of source and target."""
         if len(source.mask) <= _FEW:  # compared in less time than a table is filled in
             source_index = BruteForce.build(source.points, source.mask)
-            target_index = VoxelTable.build(target.points, target.mask)
-        else:
-            source_index, target_index = on_both(
-                lambda cloud: VoxelTable.build(cloud.points, cloud.mask),
-                *levelled(source, target),
-            )
-        return self.solve_indexed(source, target, source_index, target_index, init, key)
+            return source_index, VoxelTable.build(target.points, target.mask)
+        return on_both(
+            lambda cloud: VoxelTable.build(cloud.points, cloud.mask),
+            *levelled(source, target),
+        )
 
     def solve_indexed(
         self,
@@ -157,17 +179,22 @@ class AbstractSearch(AbstractRegistrar):
         )
         return dataclasses.replace(solution, trace=found.trace)
 
-    def _optimiser(self, dtype: Any) -> LocalOptimiser:
+    def optimiser(self, dtype: Any) -> LocalOptimiser:
+        """Residual x kernel x step, in a dtype."""
         optimiser = LocalOptimiser(self.residual, self.kernel, self.step)
         return cast_floats(optimiser, dtype)
 
-    def _start(
-        self, key: Key, num: int, init: Motion | None, dtype: Any, d: int
+    def starts(
+        self, key: Key, num: int, problem: Problem, init: Motion | None
     ) -> Float[Array, "p D D"]:
         """`num` poses of the prior and as many more as fill the last block."""
-        prior = self.prior
+        d, dtype = problem.source.shape[0], problem.source.dtype
+        prior, frames = self.prior, problem.frames
         if prior is None:
             prior = UniformPrior() if init is None else GaussianPrior()
+        if frames is not None:
+            prior = prior.in_frames(frames)
+            init = None if init is None else frames.enter(init)
         T = cast_floats(prior, dtype).draw(key, num, d, init, dtype)
         batch = min(self.batch_size, num)
         surplus = -num % batch

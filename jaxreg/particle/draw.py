@@ -22,6 +22,7 @@ from jaxreg.matching import Problem
 from jaxreg.particle.energies import AbstractEnergy
 from jaxreg.particle.measure import measure
 from jaxreg.particle.state import Particles
+from jaxreg.particle.weights import likelihood, normalised
 
 
 # Blocks in a group; one of them is settled.
@@ -40,15 +41,13 @@ class Drawn(eqx.Module):
 
     Attributes:
         particles: all that were asked for, measured; energy inf where not drawn.
-        settled: the best of each group; energy inf likewise.
-        believed: `(q,)` the energies of those; where they are sure, inf for all that
-            did not settle at the best pose.
+        settled: the best of each group; energy inf likewise, and where they are sure
+            also for all that did not settle at the best pose.
         sure: whether the settled agree.
     """
 
     particles: Particles
     settled: Particles
-    believed: Float[Array, " q"]
     sure: Bool[Array, ""]
 
 
@@ -63,6 +62,31 @@ def _groups(num: int, batch_size: int) -> tuple[int, int]:
     """Poses in a group and groups, of `num` poses in blocks of at most that many."""
     group = _BLOCKS * min(batch_size, -(-num // _BLOCKS))
     return group, -(-num // group)
+
+
+def draw_all(
+    problem: Problem,
+    optimiser: LocalOptimiser,
+    energy: AbstractEnergy,
+    T: Float[Array, "p D D"],
+    width: Scalar,
+    *,
+    num: int,
+    num_steps: int,
+    batch_size: int,
+) -> Particles:
+    """Measures the first `num` poses, as in the paper; see `draw_until_sure`."""
+    return measure(
+        problem,
+        optimiser,
+        energy,
+        Particles.at(T, num),
+        T,
+        (width, width),
+        num_rows=num,
+        num_steps=num_steps,
+        batch_size=batch_size,
+    )
 
 
 def draw_until_sure(
@@ -113,7 +137,8 @@ def draw_until_sure(
     first = first.valued(jnp.where(row < num, first.energy, jnp.inf))
     settled = particles.rows(slice(drawn, None))
     away = sure & ~_near(settled, jnp.argmin(settled.energy), _APART)
-    return Drawn(first, settled, jnp.where(away, jnp.inf, settled.energy), sure)
+    settled = settled.valued(jnp.where(away, jnp.inf, settled.energy))
+    return Drawn(first, settled, sure)
 
 
 class _Drawing(eqx.Module):
@@ -171,6 +196,20 @@ class _Drawing(eqx.Module):
         surplus = settling & jnp.isinf(measured[best])
         settled = jnp.where(surplus, jnp.inf, settled)
         return out.valued(lax.dynamic_update_slice_in_dim(energy, settled, home, 0))
+
+
+def with_settled(
+    settled: Particles, particles: Particles, sure: Bool[Array, ""]
+) -> Particles:
+    """The settled particles and those of the filter; of sure ones those that agree."""
+    energy = jnp.where(sure, jnp.inf, particles.energy)
+    energy = jnp.concatenate([settled.energy, energy])
+    T = [settled.T_target_source, particles.T_target_source]
+    out = Particles.at(jnp.concatenate(T), len(energy))
+    live = jnp.isfinite(energy)
+    size = jnp.sum(live).astype(energy.dtype)
+    log_weight = normalised(likelihood(energy, size).relative, live)
+    return eqx.tree_at(lambda p: (p.energy, p.log_weight), out, (energy, log_weight))
 
 
 def _agree(

@@ -16,51 +16,31 @@ energies; the kernel width of the optimiser falls over time. `sandhu2010` has th
 paper's own.
 """
 
-from typing import Any
-
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import (
     check_counts,
     check_not_negative,
+    check_pair,
     check_parts,
     check_shares,
 )
-from jaxreg._core.typing import Key, Motion, Scalar
-from jaxreg.local import AbstractStep, GaussNewton, LocalOptimiser
+from jaxreg._core.typing import Key, Motion
+from jaxreg.local import AbstractStep, GaussNewton
 from jaxreg.matching import AbstractResidual, PointToPlane, Problem
-from jaxreg.particle.base import AbstractSearch, Found
-from jaxreg.particle.draw import (
-    SETTLE_STEPS,
-    Drawn,
-    draw_until_sure,
-    most_look_ups,
-)
+from jaxreg.particle.base import Found
+from jaxreg.particle.draw import SETTLE_STEPS, most_look_ups, with_settled
 from jaxreg.particle.dynamics import AbstractDynamics, StochasticDynamics
 from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy
-from jaxreg.particle.measure import measure
 from jaxreg.particle.priors import AbstractPrior, GivenParticles
 from jaxreg.particle.resamplers import AbstractResampler, Systematic
-from jaxreg.particle.state import Particles
-from jaxreg.particle.trace import no_rows, with_row
-from jaxreg.particle.weights import log_likelihood, normalised
-from jaxreg.registrar import SearchTrace
+from jaxreg.particle.stepping import AbstractFilter, Filtering, run
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
 
-class _Carry(eqx.Module):
-    particles: Particles
-    time: Int[Array, ""]
-    moving: Bool[Array, ""]
-    trace: SearchTrace
-
-
-class ParticleFilter(AbstractSearch):
+class ParticleFilter(AbstractFilter):
     """Global registration by a particle filter over ICP.
 
     Lengths are in units of the target's root mean square radius, so the unit of the
@@ -152,164 +132,40 @@ class ParticleFilter(AbstractSearch):
     def most_look_ups(self) -> int:
         """Closest points looked up for each source point where never sure."""
         drawn = self.num_prior * (self.prior_steps + 1)
-        if self._settles:
+        if self.settles:
             drawn = most_look_ups(self.num_prior, self.prior_steps, self.batch_size)
         return drawn + self.num_particles * self.num_times * (self.inner_steps + 1)
 
-    @property
-    def _settles(self) -> bool:
-        """Whether it may be sure early: chance is known of bounded energies only."""
-        return self.num_agreeing > 0 and self.energy.resolution > 0
+    @eqx.filter_jit
+    def iteration(
+        self,
+        source: object,
+        target: object,
+        *,
+        key: Key,
+        source_mask: object = None,
+        target_mask: object = None,
+    ) -> Filtering:
+        """The filter on one pair, to be stepped by hand.
+
+        Args:
+            source: as in `register`, one pair; so are the target and the masks.
+            target: likewise.
+            key: draws the source points that particles are measured on.
+            source_mask: likewise.
+            target_mask: likewise.
+        """
+        pair = check_pair(source, target, source_mask, target_mask)
+        return Filtering.of(self, self.problem(pair, key))
 
     def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
         """The filter (PF paper, section 4.2)."""
-        d, dtype = problem.source.shape[0], problem.source.dtype
-        key_prior, key_loop = jax.random.split(key)
-        T = self._start(key_prior, self.num_prior, init, dtype, d)
-        optimiser = self._optimiser(dtype)
-        drawn = self._draw(problem, optimiser, T)
-
-        def body(carry: _Carry) -> _Carry:
-            key = jax.random.fold_in(key_loop, carry.time)
-            particles = self._advance(key, problem, optimiser, carry)
-            live = jnp.arange(T.shape[0]) < self.num_particles
-            error = jnp.where(live[:, None], jnp.abs(particles.motion_error), 0)
-            # Negated: an error that is not a number has not died.
-            moving = ~(jnp.max(error) <= self.tolerance)
-            trace = with_row(carry.trace, particles, self._width(carry.time, dtype))
-            particles = _remembered(particles, carry.time)
-            return _Carry(particles, carry.time + 1, moving, trace)
-
-        trace = no_rows(self.num_times + 1, dtype)
-        trace = with_row(trace, drawn.particles, self._width(0, dtype))
-        end = lax.while_loop(
-            lambda c: c.moving & (c.time <= self.num_times),
-            body,
-            _Carry(drawn.particles, jnp.ones((), jnp.int32), ~drawn.sure, trace),
-        )
-        particles = end.particles.rows(slice(self.num_particles))
-        steps = self.prior_steps + (end.time - 1) * self.inner_steps
-        if self._settles:
-            particles = _either(drawn, particles)
+        ended = run(Filtering.of(self, problem), key, init)
+        state, trace = ended.state
+        particles = state.particles.rows(slice(self.num_particles))
+        steps = self.prior_steps + state.num_steps * self.inner_steps
+        if state.settled is not None:
+            sure = state.num_steps == 0
+            particles = with_settled(state.settled, particles, sure)
             steps = steps + SETTLE_STEPS
-        return Found(particles, steps, ~end.moving, end.trace)
-
-    def _draw(
-        self, problem: Problem, optimiser: LocalOptimiser, T: Float[Array, "p D D"]
-    ) -> Drawn:
-        """The prior at t = 0, measured and weighed."""
-        start, end = (jnp.asarray(x) for x in (self.width_start, self.width_end))
-        batch = min(self.batch_size, self.num_prior)
-        if self._settles:
-            drawn = draw_until_sure(
-                problem,
-                optimiser,
-                self.energy,
-                T,
-                (start, end),
-                num=self.num_prior,
-                num_steps=self.prior_steps,
-                num_agreeing=self.num_agreeing,
-                batch_size=batch,
-            )
-        else:
-            particles = measure(
-                problem,
-                optimiser,
-                self.energy,
-                Particles.at(T, self.num_prior),
-                T,
-                (start, start),
-                num_rows=self.num_prior,
-                num_steps=self.prior_steps,
-                batch_size=batch,
-            )
-            none = particles.rows(slice(0))
-            drawn = Drawn(particles, none, none.energy, jnp.asarray(False))
-        particles = self._weighed(problem, drawn.particles, self.num_prior)
-        error = self.prior_error_share * particles.motion_error
-        particles = eqx.tree_at(lambda p: p.motion_error, particles, error)
-        if self.dynamics.needs_path:
-            path = Particles.at(T, self.num_prior, self.num_times + 1).path
-            particles = eqx.tree_at(
-                lambda p: p.path, particles, path, is_leaf=lambda x: x is None
-            )
-        particles = _remembered(particles, jnp.zeros((), jnp.int32))
-        return eqx.tree_at(lambda d: d.particles, drawn, particles)
-
-    def _advance(
-        self, key: Key, problem: Problem, optimiser: LocalOptimiser, carry: _Carry
-    ) -> Particles:
-        """Resample, predict, measure, weigh.
-
-        Resampling opens a step, so that the last particles keep their weights.
-        """
-        particles, time = carry.particles, carry.time
-        key_resample, key_predict = jax.random.split(key)
-        rows, log_weight = self.resampler(
-            key_resample,
-            particles.log_weight,
-            jnp.asarray(self.num_particles),
-            may_keep=(time != 1) | (self.num_prior == self.num_particles),
-        )
-        particles = eqx.tree_at(
-            lambda p: p.log_weight, particles.rows(rows), log_weight
-        )
-        T_predicted = self.dynamics(key_predict, particles, time)
-        width = self._width(time, T_predicted.dtype)
-        num = T_predicted.shape[0]
-        particles = measure(
-            problem,
-            optimiser,
-            self.energy,
-            eqx.tree_at(
-                lambda p: (p.motion_error, p.energy),
-                particles,
-                (
-                    jnp.zeros_like(particles.motion_error),
-                    jnp.full(num, jnp.inf, T_predicted.dtype),
-                ),
-            ),
-            T_predicted,
-            (width, width),
-            num_rows=self.num_particles,
-            num_steps=self.inner_steps,
-            batch_size=min(self.batch_size, self.num_prior),
-        )
-        return self._weighed(problem, particles, self.num_particles)
-
-    def _width(self, time: Int[Array, ""] | int, dtype: Any) -> Scalar:
-        """Kernel width at a time."""
-        share = jnp.asarray(time, dtype) / self.num_times
-        start = jnp.asarray(self.width_start, dtype)
-        return start * (self.width_end / start) ** share
-
-    def _weighed(self, problem: Problem, particles: Particles, num: int) -> Particles:
-        """With the weights of the first `num` times their likelihoods."""
-        dtype = particles.energy.dtype
-        size = jnp.minimum(self.sample_share * num, self.num_particles).astype(dtype)
-        points = jnp.maximum(jnp.sum(problem.source_mask), 1).astype(dtype)
-        coldest = self.energy.resolution / points
-        likelihood = log_likelihood(particles.energy, size, coldest)
-        live = jnp.arange(particles.energy.size) < num
-        return particles.weighted(normalised(particles.log_weight + likelihood, live))
-
-
-def _remembered(particles: Particles, time: Int[Array, ""]) -> Particles:
-    """With the motion error in the path, where one is kept."""
-    if particles.path is None:
-        return particles
-    path = particles.path.at[:, time].set(particles.motion_error)
-    return eqx.tree_at(lambda p: p.path, particles, path)
-
-
-def _either(drawn: Drawn, particles: Particles) -> Particles:
-    """The settled particles and those of the filter; of sure ones those that agree."""
-    energy = jnp.where(drawn.sure, jnp.inf, particles.energy)
-    energy = jnp.concatenate([drawn.believed, energy])
-    T = [drawn.settled.T_target_source, particles.T_target_source]
-    out = Particles.at(jnp.concatenate(T), len(energy))
-    live = jnp.isfinite(energy)
-    size = jnp.sum(live).astype(energy.dtype)
-    log_weight = normalised(log_likelihood(energy, size), live)
-    return eqx.tree_at(lambda p: (p.energy, p.log_weight), out, (energy, log_weight))
+        return Found(particles, steps, ended.converged, trace)

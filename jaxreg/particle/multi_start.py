@@ -70,9 +70,9 @@ class MultiStart(AbstractSearch):
 
     def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
         """Descends from every start, the width falling to `width_end`."""
-        d, dtype = problem.source.shape[0], problem.source.dtype
-        T = self._start(key, self.num_starts, init, dtype, d)
-        optimiser = self._optimiser(dtype)
+        dtype = problem.source.dtype
+        T = self.starts(key, self.num_starts, problem, init)
+        optimiser = self.optimiser(dtype)
         share = jnp.linspace(0, 1, self.num_steps, dtype=dtype)
         widths = self.width_start * (self.width_end / self.width_start) ** share
 

@@ -1,5 +1,7 @@
 """Weights as logarithms (PF paper, Eq. 9; section 3.3, step 2)."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -28,17 +30,38 @@ def normalised(
     return level - jax.nn.logsumexp(level)
 
 
-def log_likelihood(
+class Likelihood(NamedTuple):
+    """p(z_t | x_t) = exp(-energy / temperature), as logarithms.
+
+    Attributes:
+        relative: `(p,)` over that of the best particle, which has zero; -inf where the
+            energy is not finite, zero for all where that is all of them.
+        best: of that particle; -inf where no energy is finite.
+    """
+
+    relative: Float[Array, " p"]
+    best: Float[Array, ""]
+
+    def log_mean(self, log_weight: Float[Array, " p"]) -> Float[Array, ""]:
+        """Log of the mean by weight, over the particles that have a likelihood."""
+        counts = jnp.isfinite(self.relative) & jnp.isfinite(log_weight)
+        known = jnp.any(counts) & jnp.isfinite(self.best)
+        level = jnp.where(counts, log_weight, -jnp.inf)
+        level = jnp.where(known, level, 0)
+        mean = jax.nn.logsumexp(level + jnp.where(counts, self.relative, 0))
+        return jnp.where(known, self.best + mean - jax.nn.logsumexp(level), -jnp.inf)
+
+
+def likelihood(
     energy: Float[Array, " p"], target_size: Array | float, coldest: Array | float = 0
-) -> Float[Array, " p"]:
-    """Log p(z_t | x_t) = -energy / temperature, up to a constant; zero at the best.
+) -> Likelihood:
+    """Of measured particles.
 
     The paper's exponent, a sum over all points, has the wrong sign and underflows.
     Here the energies themselves set the temperature: the likelihoods have the given
     effective sample size, so that there is no schedule to choose, or a larger one where
     the temperature would fall below the `coldest`: poses that the points do not tell
-    apart, as those of a symmetric object, stay equally likely. Particles whose energy
-    is not finite get -inf; zero for all where that is all of them.
+    apart, as those of a symmetric object, stay equally likely.
     """
     finite = jnp.isfinite(energy)
     low = jnp.min(jnp.where(finite, energy, jnp.inf))
@@ -56,4 +79,6 @@ def log_likelihood(
 
     temperature = lax.fori_loop(0, 24, halve, (span * 1e-4, span * 1e3))[1]
     temperature = jnp.maximum(temperature, coldest)
-    return jnp.where(jnp.any(finite), -excess / temperature, 0)
+    known = jnp.any(finite)
+    best = jnp.where(known, -jnp.where(known, low, 0) / temperature, -jnp.inf)
+    return Likelihood(jnp.where(known, -excess / temperature, 0), best)

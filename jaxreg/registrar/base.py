@@ -13,10 +13,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points
-from jaxreg.cloud import PointCloud
+from jaxreg.cloud import Frames, PointCloud
 from jaxreg.geometry import lie
 from jaxreg.linear.small import solve_semidefinite
-from jaxreg.registrar.frames import Frames
 from jaxreg.registrar.trace import SearchTrace
 
 

@@ -24,8 +24,9 @@ from bench.workloads.filter_data import (
 from bench.workloads.filter_outcome import Outcome, outcome, shift_of_model
 from bench.workloads.prepared_model import ours
 from jaxreg._core.arrays import cast_floats
+from jaxreg._core.loop import iterate
 from jaxreg.cloud import PointCloud, centroid, rms_radius
-from jaxreg.correlation.ascent import ascend
+from jaxreg.correlation.ascent import Ascending
 from jaxreg.geometry import lie
 from jaxreg.matching import Problem
 from jaxreg.neighbours import VoxelTable
@@ -112,8 +113,8 @@ class _Correlation(eqx.Module):
     width: Array
 
     def __call__(self, source, target, start, key):
-        end = ascend(source, target, start, self.width, 60, jnp.asarray(1e-4))
-        return end.T_target_source
+        ascent = Ascending(source, target, self.width, jnp.asarray(1e-4))
+        return iterate(ascent, ascent.init(start), max_steps=60).state.T
 
 
 def _run(find: eqx.Module, trials: Trials) -> Outcome:

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxreg.particle.weights import effective_sample_size, log_likelihood, normalised
+from jaxreg.particle.weights import effective_sample_size, likelihood, normalised
 
 
 P = 64
-LIKELIHOOD = jax.jit(log_likelihood)
+LIKELIHOOD = jax.jit(lambda *args: likelihood(*args).relative)
 
 
 @settings(max_examples=25, deadline=None)
@@ -39,7 +39,7 @@ def test_energies_nearer_than_the_coldest_temperature_are_nearly_equal():
 
 @pytest.mark.parametrize("value", [0.3, np.inf, np.nan])
 def test_equal_or_infinite_energies_give_uniform_weights(value):
-    log_p = log_likelihood(jnp.full(P, value, jnp.float32), P / 2)
+    log_p = likelihood(jnp.full(P, value, jnp.float32), P / 2).relative
     weight = np.exp(normalised(log_p, jnp.arange(P) < 48))
     np.testing.assert_allclose(weight[:48], 1 / 48, rtol=1e-5)
     np.testing.assert_array_equal(weight[48:], 0)
@@ -47,7 +47,7 @@ def test_equal_or_infinite_energies_give_uniform_weights(value):
 
 def test_particles_of_infinite_energy_get_no_weight():
     energy = jnp.linspace(0, 1, P).at[3].set(jnp.inf).at[5].set(jnp.nan)
-    log_p = log_likelihood(energy, P / 2)
+    log_p = likelihood(energy, P / 2).relative
     weight = np.exp(normalised(log_p, jnp.ones(P, bool)))
     assert weight[3] == weight[5] == 0
     assert weight.sum() == pytest.approx(1, abs=1e-5)

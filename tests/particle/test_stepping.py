@@ -1,0 +1,147 @@
+"""A filter stepped by hand: what the search does, and what a step tells."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import blob, motion, move, pose_error
+from jaxtyping import Array
+
+import jaxreg as jr
+from jaxreg._core.arrays import traced
+from jaxreg.local import LocalOptimiser
+from jaxreg.particle import (
+    AbstractResampler,
+    GivenParticles,
+    NoDynamics,
+    ParticleFilter,
+    ParticleState,
+)
+
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+N, P, D = 96, 24, 2
+KEY = jax.random.key(0)
+# Far from the origin and in a small unit; the last start is near the truth.
+TRUTH = motion(5, D, shift=300.0)
+TARGET = 100 * blob(N, D) + np.float32(500)
+SOURCE = move(np.linalg.inv(TRUTH), TARGET)
+NEAR = TRUTH @ motion(7, D, angle=0.05, shift=1.0)
+STARTS = np.stack([motion(i, D, shift=300.0) for i in range(P - 1)] + [NEAR])
+
+
+class _Shifted(AbstractResampler):
+    """The ancestor of row i is row 5 i + 3."""
+
+    threshold: Array | float = traced(1.0)
+
+    def draw(self, key, weight, num):
+        return ((5 * jnp.arange(len(weight)) + 3) % P).astype(jnp.int32)
+
+
+METHOD = ParticleFilter(
+    num_prior=P,
+    num_particles=P,
+    num_times=3,
+    prior_steps=2,
+    inner_steps=2,
+    num_agreeing=0,
+    batch_size=P,
+    prior=GivenParticles(STARTS),
+    resampler=_Shifted(),
+    dynamics=NoDynamics(),
+    tolerance=0.0,
+)
+
+
+@pytest.fixture(scope="module")
+def filtering():
+    return METHOD.iteration(SOURCE, TARGET, key=KEY)
+
+
+@pytest.fixture(scope="module")
+def history(filtering):
+    """States at t = 0, 1, 2, 3, and what was told of the last three."""
+    init, step = eqx.filter_jit(filtering.init), eqx.filter_jit(filtering.step)
+    key_init, key_steps = jax.random.split(KEY)
+    states, infos = [init(key_init)], []
+    for t in range(1, METHOD.num_times + 1):
+        assert not filtering.terminate(states[-1])
+        state, info = step(jax.random.fold_in(key_steps, t), states[-1])
+        states.append(state)
+        infos.append(info)
+    return states, infos
+
+
+def test_the_search_takes_these_steps(filtering, history):
+    search = eqx.filter_jit(lambda problem: METHOD.search(KEY, problem, None))
+    found, end = search(filtering.problem), history[0][-1]
+    np.testing.assert_allclose(
+        found.particles.T_target_source, end.T_target_source, atol=1e-4
+    )
+    np.testing.assert_allclose(found.particles.log_weight, end.log_weight, atol=1e-2)
+    assert int(found.num_steps) == 2 + 3 * 2
+    assert found.trace is not None
+    sizes = [info.effective_sample_size for info in history[1]]
+    np.testing.assert_allclose(found.trace.effective_size[1:], sizes, rtol=1e-3)
+
+
+def test_ancestors_are_the_rows_that_particles_were_copied_from(filtering, history):
+    states, infos = history
+    optimiser = LocalOptimiser(METHOD.residual, METHOD.kernel, METHOD.step)
+    descend = jax.jit(
+        jax.vmap(lambda T, w: optimiser.repeat(filtering.problem, T, w), (0, None))
+    )
+    for before, after, info in zip(states[:-1], states[1:], infos, strict=True):
+        np.testing.assert_array_equal(info.ancestors, (5 * np.arange(P) + 3) % P)
+        widths = jnp.full(2, filtering.width(after.num_steps))
+        moved = descend(before.T_target_source[info.ancestors], widths)
+        np.testing.assert_allclose(after.T_target_source, moved, atol=1e-4)
+        error = np.abs(after.particles.motion_error).max()
+        assert float(info.moved) == pytest.approx(error)
+
+
+def test_evidence_is_the_mean_likelihood_of_each_time(history):
+    states, infos = history
+    total = float(states[0].log_evidence)
+    for state, info in zip(states[1:], infos, strict=True):
+        # All were resampled: weights before are equal, after they are likelihoods.
+        energy = np.asarray(state.particles.energy, np.float64)
+        log_weight = np.asarray(state.log_weight, np.float64)
+        slope = np.polyfit(energy, log_weight, 1)[0]
+        expected = np.log(np.mean(np.exp(slope * energy)))
+        assert float(info.log_evidence) == pytest.approx(expected, abs=0.02)
+        size = 1 / np.sum(np.exp(2 * log_weight))
+        assert float(info.effective_sample_size) == pytest.approx(size, rel=1e-3)
+        total += expected
+    assert float(states[-1].log_evidence) == pytest.approx(total, abs=0.05)
+
+
+def test_poses_leave_for_the_frames_of_the_input(filtering, history):
+    frames = filtering.problem.frames
+    first, last = history[0][0], history[0][-1]
+    angle, shift = pose_error(frames.leave(last.particles.measurement), TRUTH)
+    assert angle < 0.02
+    assert shift < 2
+    # Given starts, two small steps before, were in those frames, too.
+    near = frames.leave(first.T_target_source[-1])
+    assert pose_error(near, TRUTH)[0] < 0.1
+    np.testing.assert_allclose(frames.enter(frames.leave(near)), near, atol=1e-2)
+
+
+def test_a_filter_that_is_sure_terminates_at_once():
+    method = jr.ParticleFilter(num_prior=64, num_particles=8, batch_size=8)
+    filtering = method.iteration(SOURCE, TARGET, key=KEY)
+    state = eqx.filter_jit(filtering.init)(KEY)
+    assert isinstance(state, ParticleState)
+    assert bool(filtering.terminate(state))
+    assert state.settled is not None
+    assert filtering.problem.frames is not None
+    T = filtering.problem.frames.leave(state.settled.measurement)
+    angle, shift = pose_error(T, TRUTH)
+    assert angle < 0.05
+    assert shift < 5
+    with pytest.raises(ValueError, match="source: wanted shape"):
+        method.iteration(SOURCE[None], TARGET[None], key=KEY)
