@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import motion
-from jaxreg.registrar.frames import Frames
+
+from jaxreg.cloud import Frames
 from jaxreg.registration.pair import _distinct_enough
 
 
