@@ -6,7 +6,7 @@ import pytest
 from helpers import motion
 
 from jaxreg.cloud import Frames
-from jaxreg.registration.pair import _distinct_enough
+from jaxreg.cloud.frames import _distinct_enough
 
 
 @pytest.mark.parametrize("d", [2, 3])
