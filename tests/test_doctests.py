@@ -25,7 +25,7 @@ EXAMPLES = _examples()
 
 def test_what_people_call_first_has_an_example():
     names = {test.name.split(".")[-1] for test in EXAMPLES}
-    assert {"register", "average", "from_edges", "read_points", "Solution"} <= names
+    assert {"register", "average", "from_edges", "read_points", "draw"} <= names
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda test: test.name)
