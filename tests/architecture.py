@@ -25,6 +25,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("averaging",),
     ("multiview",),
     ("io.errors", "io.quaternions"),
+    ("io.files",),
     ("io.extras", "io.rows", "io.atomic"),
     ("io.points",),
     ("io.poses", "io.graphs"),

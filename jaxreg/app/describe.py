@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
+from jaxreg.io.files import text_lines
 from jaxreg.io.graphs import g2o
 from jaxreg.io.graphs.toro import read_toro
 from jaxreg.io.points.read import NamedPoints, read_named
-from jaxreg.io.rows import text_lines
 
 
 _MAX_POINTS = 5_000_000
@@ -205,6 +205,6 @@ def _graph(path: Path) -> GraphFacts:
 
 
 def _unknown_lines(path: Path, kinds: Sequence[str]) -> dict[str, int]:
-    words = (line.split(maxsplit=1)[:1] for line in text_lines(path))
+    words = (line.split(maxsplit=1)[:1] for _, line in text_lines(path))
     tags = collections.Counter(w[0] for w in words if w and w[0][0] != "#")
     return {tag: num for tag, num in tags.items() if tag not in kinds}

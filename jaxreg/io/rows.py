@@ -1,37 +1,14 @@
 """Lines of numbers in text files, with errors that name the file and the line."""
 
-import gzip
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from jaxreg.io.errors import InputError
+from jaxreg.io.files import text_lines
 
 
 Line = tuple[int, list[str]]
-
-
-def text_lines(path: str | Path) -> list[str]:
-    """The lines of a text file of poses or motions, unpacked if it ends in `.gz`.
-
-    Raises:
-        InputError: if the file cannot be read as text.
-    """
-    packed = str(path).lower().endswith(".gz")
-    try:
-        with (gzip.open if packed else open)(path, "rt", encoding="utf-8") as file:
-            return file.read().splitlines()
-    except UnicodeDecodeError as err:
-        raise InputError(
-            f"{path}: not a text file.\n"
-            "Give poses or a pose graph; scans go to: jaxreg multiview"
-        ) from err
-    except (OSError, EOFError, zlib.error) as err:
-        reason = getattr(err, "strerror", None) or err
-        raise InputError(
-            f"{path}: cannot be read ({reason}).\nCheck the name and the permissions."
-        ) from err
 
 
 def read_lines(path: str | Path) -> list[Line]:
@@ -40,8 +17,7 @@ def read_lines(path: str | Path) -> list[Line]:
     Raises:
         InputError: if the file cannot be read as text.
     """
-    lines = text_lines(path)
-    words = [(k, line.split("#")[0].split()) for k, line in enumerate(lines, start=1)]
+    words = ((k, line.split("#")[0].split()) for k, line in text_lines(path))
     return [(k, row) for k, row in words if row]
 
 

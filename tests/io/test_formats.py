@@ -222,10 +222,7 @@ def test_of_large_scans_every_so_many_points_are_kept(
 
 
 @pytest.mark.parametrize("kind", ["obj", "stl", "stl_ascii"])
-def test_of_large_meshes_some_vertices_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-):
-    monkeypatch.setattr("jaxreg.io.points.meshes._LARGE", 1000)
+def test_of_large_meshes_some_vertices_are_kept(tmp_path: Path, kind: str):
     ball = trimesh.creation.icosphere(2, 2.0)
     ball.faces = np.random.default_rng(0).permutation(ball.faces)
     path = tmp_path / f"a.{kind[:3]}"
@@ -290,7 +287,7 @@ def test_a_suffix_that_lies(tmp_path: Path, content: bytes, suffix: str, said: s
 
 @pytest.mark.parametrize(
     ("name", "package"),
-    [("a.pcd", "pypcd4"), ("a.las", "laspy"), ("a.e57", "pye57"), ("a.obj", "trimesh")],
+    [("a.pcd", "pypcd4"), ("a.las", "laspy"), ("a.e57", "pye57")],
 )
 def test_a_missing_reader_names_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str
@@ -299,7 +296,7 @@ def test_a_missing_reader_names_its_extra(
         raise ModuleNotFoundError(f"No module named {wanted!r}", name=wanted)
 
     starts = {"a.las": b"LASF", "a.e57": b"ASTM-E57", "a.pcd": PCD.encode()}
-    (tmp_path / name).write_bytes(starts.get(name, OBJ.encode()))
+    (tmp_path / name).write_bytes(starts[name])
     monkeypatch.setattr(importlib, "import_module", missing)
     said = rf"{package}, which is not installed\.\n.*jaxreg\[formats\]"
     with pytest.raises(MissingExtraError, match=said):

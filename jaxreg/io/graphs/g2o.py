@@ -20,8 +20,8 @@ from jaxreg.graph.edge_checks import EdgeError
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
+from jaxreg.io.files import text_lines
 from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
-from jaxreg.io.rows import text_lines
 
 
 _VERTEX = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
@@ -176,7 +176,7 @@ def _lines(tag: str, ids: np.ndarray, values: np.ndarray, digits: int) -> list[s
 
 def _parse(path: Path) -> _File:
     found: dict[str, list[tuple[int, list[str]]]] = collections.defaultdict(list)
-    for number, line in enumerate(text_lines(path), start=1):
+    for number, line in text_lines(path):
         words = line.split()
         if words and not words[0].startswith("#"):
             found[words[0]].append((number, words[1:]))

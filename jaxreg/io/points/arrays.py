@@ -2,13 +2,13 @@
 
 import io
 import zipfile
-import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxreg.io.errors import InputError
+from jaxreg.io.files import reading
 from jaxreg.io.points.thinning import Step, every_row, records
 
 
@@ -16,6 +16,18 @@ _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+_LONGEST_HEADER = 10_000
+# Of DEFLATE; a header that promises more lies.
+_MOST_RATIO = 1100
+
+
+class _Layout(NamedTuple):
+    """Of an array in the NPY format: what its header says, and where the data begin."""
+
+    shape: tuple[int, ...]
+    by_columns: bool
+    dtype: np.dtype
+    start: int
 
 
 def parse_npy(
@@ -24,25 +36,19 @@ def parse_npy(
     """The points of an NPY file, `(n, d)`, no names, and of how many one was kept.
 
     Args:
-        data: its content; None maps the file into memory.
+        data: its content; None reads the file.
         path: of the file, and for messages.
         step: tells from the number of rows which of them to keep.
 
     Raises:
         InputError: if it holds no `(n, 2)` or `(n, 3)` array of numbers.
     """
-    try:
-        if data is None:
-            array = np.load(path, allow_pickle=False, mmap_mode="r")
-        else:
-            array = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as err:
-        raise InputError(
-            f"{path}: not a NumPy file of plain numbers.\n"
-            "Save it with numpy.save as one float array of shape (n, 3) or (n, 2)."
-        ) from err
-    every = step(max(len(array), 1)) if array.ndim else 1
-    return as_points(array[::every] if array.ndim else array, str(path)), (), every
+    advice = "Save it with numpy.save as one float array of shape (n, 3) or (n, 2)."
+    with reading(path, "NumPy", advice):
+        size = path.stat().st_size if data is None else len(data)
+        with path.open("rb") if data is None else io.BytesIO(data) as file:
+            points, every = _some_rows(file, size, str(path), step)
+    return points, (), every
 
 
 def parse_npz(
@@ -55,55 +61,74 @@ def parse_npz(
     Raises:
         InputError: if an array is none of points, or there is none.
     """
-    try:
-        arrays = {}
+    arrays: dict[str, tuple[np.ndarray, tuple[str, ...], int]] = {}
+    with reading(path, "NPZ", "Save it with numpy.savez(file, name=points, ...)."):
         with zipfile.ZipFile(path) as archive:
-            for name in archive.namelist():
-                with archive.open(name) as file:
-                    arrays[name.removesuffix(".npy")] = _some_rows(file, step)
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError, zlib.error) as err:
-        raise InputError(
-            f"{path}: not an NPZ file of plain numbers.\n"
-            "Save it with numpy.savez(file, name=points, ...)."
-        ) from err
+            for info in archive.infolist():
+                key = info.filename.removesuffix(".npy")
+                if key in arrays:
+                    raise ValueError(f"two arrays are called {key}")
+                if info.file_size > _MOST_RATIO * (info.compress_size + 100):
+                    raise ValueError(f"{key} says that it has {info.file_size} bytes")
+                with archive.open(info) as file:
+                    name = f"{path}:{key}"
+                    points, every = _some_rows(file, info.file_size, name, step)
+                arrays[key] = points, (), every
     if not arrays:
         raise InputError(f"{path}: holds no arrays.\nSave each scan under a name.")
-    return {
-        key: (as_points(rows, f"{path}:{key}"), (), every)
-        for key, (rows, every) in arrays.items()
-    }
+    return arrays
 
 
-def _some_rows(file: Any, step: Step) -> tuple[np.ndarray, int]:
+def _some_rows(file: Any, size: int, name: str, step: Step) -> tuple[np.ndarray, int]:
     """Of an array in the NPY format, and of how many one was kept."""
-    version = np.lib.format.read_magic(file)
+    shape, by_columns, dtype, start = _layout(file)
+    _require_points(shape, dtype, name)
+    num, width = shape
+    if start + num * width * dtype.itemsize != size:
+        raise ValueError(
+            f"its header promises shape {shape} of {dtype}, {size - start} bytes follow"
+        )
+    every = step(num)
+    if not by_columns:
+        return as_points(records(file, num, np.dtype((dtype, (width,))), every)), every
+    columns = [records(file, num, dtype, every) for _ in range(width)]
+    return as_points(np.stack(columns, axis=1)), every
+
+
+def _layout(file: Any) -> _Layout:
+    """Reads the header; the file stands at the data."""
+    head = io.BytesIO(file.read(_LONGEST_HEADER))
+    version = np.lib.format.read_magic(head)
     if version not in _HEADERS:
         raise ValueError(f"version {version}")
-    shape, by_columns, dtype = _HEADERS[version](file)
+    shape, by_columns, dtype = _HEADERS[version](head)
     if dtype.hasobject:
-        raise ValueError("objects")
-    if len(shape) != 2:  # for the message alone: a view of one zero
-        return np.broadcast_to(np.zeros((), dtype), shape), 1
-    num, width = shape
-    every = step(max(num, 1))
-    if not by_columns:
-        return records(file, num, np.dtype((dtype, (width,))), every), every
-    columns = [records(file, num, dtype, every) for _ in range(width)]
-    return np.stack(columns, axis=1), every
+        raise ValueError("objects, not plain numbers")
+    file.seek(head.tell())
+    return _Layout(shape, by_columns, dtype, head.tell())
 
 
-def as_points(array: np.ndarray, name: str) -> np.ndarray:
+def _require_points(shape: tuple[int, ...], dtype: np.dtype, name: str) -> None:
+    """Refuses arrays of another shape or type before they are read.
+
+    Raises:
+        InputError: unless it is `(n, 2)` or `(n, 3)`, n > 0, of numbers.
+    """
+    if len(shape) != 2 or shape[1] not in (2, 3) or dtype.kind not in "fiu":
+        raise InputError(
+            f"{name}: found an array of shape {shape} and type {dtype}.\n"
+            "Wanted numbers of shape (n, 3) or (n, 2), one point a row."
+        )
+    if shape[0] == 0:
+        raise InputError(f"{name}: holds no points.\nExport or copy the scan again.")
+
+
+def as_points(array: np.ndarray, name: str = "points") -> np.ndarray:
     """The array as float32 or float64 points; `name` is for messages only.
 
     Raises:
         InputError: unless it holds numbers of shape `(n, 2)` or `(n, 3)`, n > 0.
     """
-    if array.ndim != 2 or array.shape[1] not in (2, 3) or array.dtype.kind not in "fiu":
-        raise InputError(
-            f"{name}: found an array of shape {array.shape} and type {array.dtype}.\n"
-            "Wanted numbers of shape (n, 3) or (n, 2), one point a row."
-        )
-    if array.shape[0] == 0:
-        raise InputError(f"{name}: holds no points.\nExport or copy the scan again.")
+    _require_points(array.shape, array.dtype, name)
     narrow = array.dtype.kind == "f" and array.dtype.itemsize <= 4
-    return array.astype(np.float32 if narrow else np.float64)
+    return array.astype(np.float32 if narrow else np.float64, copy=False)

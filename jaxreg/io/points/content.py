@@ -28,6 +28,10 @@ def require_suffix(data: bytes, suffix: str, path: Path) -> None:
         if data.startswith(start) and suffix not in suffixes:
             packed = ".gz" if path.name.lower().endswith(".gz") else ""
             wanted = suffixes[0] + packed if suffixes else f"{suffix}.gz"
+            if packed and not suffixes:
+                raise InputError(
+                    f"{path}: is compressed twice.\nUnpack it once, or both times."
+                )
             raise InputError(
                 f"{path}: {kind} file by its content, whatever its name says.\n"
                 f"Rename it to end in {wanted}."

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxreg.io.extras import require, unreadable
+from jaxreg.io.extras import require
+from jaxreg.io.files import reading
 from jaxreg.io.points.arrays import as_points
 from jaxreg.io.points.thinning import Step, every_row
 
@@ -35,19 +36,20 @@ def read_e57(
     """
     pye57 = require("pye57", "Reading E57")
     scans = {}
-    try:
+    with reading(path, "E57"):
+        size = path.stat().st_size
         with pye57.E57(str(path)) as file:
             for k in range(file.scan_count):
                 header = file.get_header(k)
+                if header.point_count > 8 * size:  # not a bit each
+                    raise ValueError(f"{header.point_count} points in {size} bytes")
                 every = step(max(header.point_count, 1))
                 points = _some_points(pye57, file, header, every)
                 name = _name(header, k)
                 name = f"{name}-{k}" if name in scans else name
                 scans[name] = points, tuple(header.point_fields), every
-    except Exception as err:  # whatever a reader meets in damaged data
-        raise unreadable(path, "E57", err) from err
-    if not scans:
-        raise unreadable(path, "E57", "no scans")
+        if not scans:
+            raise ValueError("no scans")
     return {
         name: (as_points(points, f"{path}:{name}"), fields, every)
         for name, (points, fields, every) in scans.items()
@@ -59,7 +61,8 @@ def _some_points(pye57: Any, file: Any, header: Any, every: int) -> np.ndarray:
     system = header.get_coordinate_system(pye57.e57.COORDINATE_SYSTEMS)
     flag = f"{system.name.lower()}InvalidState"
     flags = [flag] if flag in header.point_fields else []
-    data, buffers = file.make_buffers([*system.value, *flags], _CHUNK)
+    chunk = min(_CHUNK, max(header.point_count, 1))
+    data, buffers = file.make_buffers([*system.value, *flags], chunk)
     chunks, found = header.points.reader(buffers), 0
     parts = [np.zeros((0, 3))]
     while count := chunks.read():

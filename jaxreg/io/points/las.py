@@ -1,17 +1,22 @@
 """LAS and LAZ files of airborne and terrestrial laser scans, through laspy."""
 
 import io
+import struct
 from pathlib import Path
 
 import numpy as np
 
-from jaxreg.io.extras import require, unreadable
+from jaxreg.io.extras import require
+from jaxreg.io.files import reading
 from jaxreg.io.points.arrays import as_points
 from jaxreg.io.points.thinning import Step, every_row
 
 
 # Points that are unpacked at a time, some 34 bytes each.
 _CHUNK = 1_000_000
+# Bytes of a header of version 1.0 to 1.2, of a record of variable length before and
+# behind the points; a point takes at least twenty, packed a fiftieth of a byte.
+_SHORTEST, _VLR, _EVLR, _POINT, _MOST_RATIO = 227, 54, 60, 20, 1000
 
 
 def parse_las(
@@ -34,19 +39,56 @@ def parse_las(
     """
     laspy = require("laspy", "Reading LAS and LAZ")
     require("lazrs", "Reading LAZ")
-    try:
+    size = path.stat().st_size if data is None else len(data)
+    with reading(path, "LAS or LAZ"):
+        with path.open("rb") if data is None else io.BytesIO(data) as file:
+            _check_header(file, size)
         with laspy.open(path if data is None else io.BytesIO(data)) as file:
             fields = tuple(file.header.point_format.dimension_names)
             promised, found, parts = file.header.point_count, 0, []
             every = step(max(promised, 1))
-            for chunk in file.chunk_iterator(_CHUNK):
+            for chunk in file.chunk_iterator(min(_CHUNK, max(promised, 1))):
                 first = -found % every
                 columns = [getattr(chunk, axis)[first::every] for axis in "xyz"]
                 parts.append(np.stack(columns, axis=1).astype(np.float64))
                 found += len(chunk)
-    except Exception as err:  # whatever a reader meets in damaged data
-        raise unreadable(path, "LAS or LAZ", err) from err
-    if found != promised:
-        raise unreadable(path, "LAS or LAZ", f"{found} points of {promised}")
-    points = np.concatenate(parts) if parts else np.zeros((0, 3))
+        if found != promised:
+            raise ValueError(f"{found} points of {promised}")
+        points = np.concatenate(parts) if parts else np.zeros((0, 3))
+        if not np.isfinite(points).all():
+            raise ValueError("scales or offsets are not finite")
     return as_points(points, str(path)), fields, every
+
+
+def _check_header(file: io.BufferedIOBase, size: int) -> None:
+    """Compares the counts of the header with the size of the file.
+
+    Raises:
+        ValueError: that names the count.
+    """
+    head = file.read(375)
+    if len(head) < _SHORTEST or head[:4] != b"LASF":
+        raise ValueError("no header")
+    length, start, num_records, kind, point = struct.unpack_from("<HIIBH", head, 94)
+    (num_points,) = struct.unpack_from("<I", head, 107)
+    if not _SHORTEST <= length <= start <= size:
+        raise ValueError(f"points are to begin at byte {start} of {size}")
+    if num_records * _VLR > start - length:
+        raise ValueError(f"{num_records} records of variable length do not fit in")
+    if head[25] >= 4 and len(head) == 375:
+        first, number = struct.unpack_from("<QI", head, 235)
+        (wide,) = struct.unpack_from("<Q", head, 247)
+        if num_points not in (0, wide):
+            raise ValueError(f"its two counts of points are {num_points} and {wide}")
+        num_points = wide
+        if number and not (start <= first and first + number * _EVLR <= size):
+            raise ValueError(f"{number} extended records of variable length do not fit")
+        room = (first if number else size) - start
+    else:
+        room = size - start
+    packed = bool(kind & 0x80)
+    if point < _POINT or num_points * point > room * (_MOST_RATIO if packed else 1):
+        raise ValueError(f"{num_points} points of {point} bytes in {room} bytes")
+    # A few bytes behind the points are usual, a whole point is not.
+    if not packed and room - num_points * point >= point:
+        raise ValueError(f"{num_points} points promised, more are there")

@@ -1,29 +1,27 @@
-"""The vertices of meshes, OBJ and STL, through trimesh; of large ones without it."""
+"""The vertices of meshes: Wavefront OBJ and STL, text or binary.
+
+By hand: trimesh takes ten times what is kept and passes over damaged lines.
+"""
 
 import io
-import itertools
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from jaxreg.io.extras import require, unreadable
+from jaxreg.io.errors import InputError
+from jaxreg.io.files import reading
 from jaxreg.io.points.arrays import as_points
-from jaxreg.io.points.thinning import Step, every_row, number_rows, records
+from jaxreg.io.points.thinning import Step, byte_lines, number_rows, records
 
 
-# Bytes of a file from which on no mesh is built: trimesh has no other way to read and
-# takes 10 GB for 20 million vertices, lines and records by blocks half of one.
-_LARGE = 100_000_000
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("tag", "<u2")])
 _Scan = tuple[np.ndarray, tuple[str, ...], int]
 
 
-def parse_obj(data: bytes | None, path: Path, step: Step = every_row) -> _Scan:
+def parse_obj(data: bytes | None, path: Path, step: Step) -> _Scan:
     """The vertices of an OBJ file; of one with faces, those that a face uses.
-
-    A large one that is not compressed is thinned line by line, with vertices that no
-    face uses.
 
     Args:
         data: its content; None reads the file.
@@ -31,62 +29,120 @@ def parse_obj(data: bytes | None, path: Path, step: Step = every_row) -> _Scan:
         step: tells from the number of vertices which of them to keep.
 
     Returns:
-        `(n, 3)` distinct vertices in the order of the file (within a material), float32
-        if that loses nothing, else float64; no names of columns; of how many
-        vertices one was kept.
+        `(n, 3)` distinct vertices in the order of the file, float32 if that loses
+        nothing, else float64; no names of columns; of how many vertices one was kept.
 
     Raises:
-        InputError: if the data are no OBJ file or hold no vertices.
-        MissingExtraError: if trimesh is not installed.
+        InputError: if the data are no OBJ file, hold no vertices, or a vertex has no
+            three numbers or a face no such vertex, which the message names by its line.
     """
-    return _vertices(data, path, "obj", b"v", step)
+    with reading(path, "OBJ"), _open(data, path) as file:
+        points, faces = _obj(file, path)
+        if len(faces):
+            used = np.zeros(len(points), bool)
+            used[faces] = True
+            points = points[used]
+    return _distinct(points, path, step)
 
 
-def parse_stl(data: bytes | None, path: Path, step: Step = every_row) -> _Scan:
+def parse_stl(data: bytes | None, path: Path, step: Step) -> _Scan:
     """The corners of the triangles of an STL file, each once; else as `parse_obj`.
 
-    Of a large binary one the first corners of every so many triangles are kept.
+    Of a binary one that is to be thinned, the first corners of every so many triangles
+    are kept.
     """
-    return _vertices(data, path, "stl", b"vertex", step)
-
-
-def _vertices(
-    data: bytes | None, path: Path, kind: str, word: bytes, step: Step
-) -> _Scan:
-    trimesh = require("trimesh", "Reading OBJ and STL")
-    try:
-        if data is None and step is not every_row and path.stat().st_size > _LARGE:
-            points, every = _some_vertices(path, word, step)
-        else:
-            every, content = 1, path.read_bytes() if data is None else data
-            scene = trimesh.load_scene(
-                io.BytesIO(content), file_type=kind, process=False, maintain_order=True
+    size = path.stat().st_size if data is None else len(data)
+    with reading(path, "STL"), _open(data, path) as file:
+        head = file.read(84)
+        num = int.from_bytes(head[80:], "little")
+        if len(head) == 84 and size == 84 + num * _TRIANGLE.itemsize:
+            every = step(num)
+            corners = records(file, num, _TRIANGLE, every)["corners"]
+            points = (corners if every == 1 else corners[:, :1]).reshape(-1, 3)
+            return *_distinct(points, path, lambda _: 1)[:2], every
+        if not head.lstrip().startswith(b"solid"):
+            raise ValueError(
+                f"{num} triangles promised, {size} bytes found"
+                if len(head) == 84
+                else "shorter than its header"
             )
-            parts = [np.asarray(g.vertices, float) for g in scene.geometry.values()]
-            points = np.concatenate(parts)
-    except Exception as err:  # whatever a reader meets in damaged data
-        raise unreadable(path, kind.upper(), err) from err
-    # STL repeats a vertex for every triangle, OBJ for every material.
+        file.seek(0)
+        points = number_rows(_corners(file), [1, 2, 3])
+    return _distinct(points, path, step)
+
+
+def _open(data: bytes | None, path: Path) -> io.BufferedIOBase:
+    return path.open("rb") if data is None else io.BytesIO(data)
+
+
+def _distinct(points: np.ndarray, path: Path, step: Step) -> _Scan:
+    """STL repeats a vertex for every triangle, OBJ for every seam."""
+    if len(points) == 0:
+        raise InputError(f"{path}: holds no points.\nExport or copy the scan again.")
     _, first = np.unique(points, axis=0, return_index=True)
-    points = points[np.sort(first)]
-    narrow = points.astype(np.float32)
+    every = step(len(first))
+    points = points[np.sort(first)[::every]]
+    with np.errstate(over="ignore", invalid="ignore"):
+        narrow = points.astype(np.float32)
     exact = np.array_equal(narrow, points, equal_nan=True)
     return as_points(narrow if exact else points, str(path)), (), every
 
 
-def _some_vertices(path: Path, word: bytes, step: Step) -> tuple[np.ndarray, int]:
-    """One corner of some triangles of a binary STL file, else what some lines hold."""
-    with path.open("rb") as file:
-        num = int.from_bytes(file.read(84)[80:], "little")
-        if path.stat().st_size == 84 + num * _TRIANGLE.itemsize:
-            rows = records(file, num, _TRIANGLE, step(num))
-            return rows["corners"][:, 0], step(num)
-    every = step(sum(1 for _ in _lines(path, word)))
-    lines = itertools.islice(_lines(path, word), 0, None, every)
-    return number_rows(lines, [1, 2, 3]), every
+def _obj(file: io.BufferedIOBase, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """All vertices, `(n, 3)`, and the numbers of those that a face names."""
+    vertices, faces = array("d"), array("q")
+    for number, line in enumerate(byte_lines(file), start=1):
+        word, *values = line.split(b"#")[0].split() or [b""]
+        try:
+            if word == b"v":
+                if not 3 <= len(values) <= 8:
+                    raise ValueError(f"a vertex of {len(values)} numbers")
+                vertices.extend([float(x) for x in values[:3]])
+            elif word == b"f":
+                named = [int(x.split(b"/", 1)[0]) for x in values]
+                _require_face(named, len(vertices) // 3)
+                num = len(vertices) // 3
+                faces.extend([k - 1 if k > 0 else num + k for k in named])
+            elif b"\0" in line:
+                raise ValueError("NUL bytes")
+        except ValueError as err:
+            raise InputError(
+                f"{path}, line {number}: {err}; the file is damaged or no OBJ file.\n"
+                "Export the scan again, or as PLY."
+            ) from err
+    points = np.frombuffer(vertices).reshape(-1, 3)
+    used = np.frombuffer(faces, dtype=np.int64)
+    if used.size and used.max() >= len(points):
+        raise ValueError(
+            f"a face names vertex {used.max() + 1}, there are {len(points)}"
+        )
+    return points, used
 
 
-def _lines(path: Path, word: bytes) -> Iterator[bytes]:
-    """Those that begin with the word."""
-    with path.open("rb") as file:
-        yield from (line for line in file if line.split(None, 1)[:1] == [word])
+def _require_face(named: list[int], num: int) -> None:
+    if len(named) < 3 or 0 in named or min(named) < -num:
+        raise ValueError(f"a face of the vertices {named}")
+
+
+def _corners(file: io.BufferedIOBase) -> Iterator[bytes]:
+    """The lines of vertices of an ASCII file, checked to be three a triangle."""
+    inside, corners, ended = False, 0, False
+    for line in byte_lines(file):
+        word = line.split(None, 1)[:1]
+        if word == [b"vertex"]:
+            if len(line.split()) != 4 or not inside:
+                raise ValueError(f"the line {line[:40]!r}")
+            corners += 1
+            yield line
+        elif word == [b"facet"]:
+            inside, ended = True, False
+        elif word == [b"endfacet"]:
+            if corners != 3 or not inside:
+                raise ValueError(f"a triangle of {corners} corners")
+            inside, corners = False, 0
+        elif word == [b"endsolid"]:
+            ended = True
+        elif word not in ([], [b"solid"], [b"outer"], [b"endloop"], [b"color"]):
+            raise ValueError(f"the line {line[:40]!r}")
+    if inside or not ended:
+        raise ValueError("no line endsolid at its end")

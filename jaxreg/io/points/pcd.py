@@ -2,14 +2,19 @@
 
 import io
 import itertools
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxreg.io.extras import require, unreadable
+from jaxreg.io.extras import require
+from jaxreg.io.files import reading
 from jaxreg.io.points.arrays import as_points
-from jaxreg.io.points.thinning import Step, every_row, number_rows, records
+from jaxreg.io.points.thinning import Step, byte_lines, every_row, number_rows, records
+
+
+_LONGEST_LINE = 100_000
 
 
 def parse_pcd(
@@ -36,28 +41,65 @@ def parse_pcd(
         MissingExtraError: if pypcd4 is not installed.
     """
     pypcd4 = require("pypcd4", "Reading PCD")
-    try:
+    size = path.stat().st_size if data is None else len(data)
+    with reading(path, "PCD"):
         with path.open("rb") if data is None else io.BytesIO(data) as file:
             header = pypcd4.MetaData.parse_header(_header(file))
+            _check_header(pypcd4, header, file, size)
             fields = tuple(header.fields)
             names = ["x", "y", "z"] if "z" in fields else ["x", "y"]
             every = step(max(header.points, 1))
             columns = _columns(pypcd4, file, header, names, every)
-    except Exception as err:  # whatever a reader meets in damaged data
-        raise unreadable(path, "PCD", err) from err
-    if len(columns[0]) != -(-header.points // every):
-        raise unreadable(path, "PCD", f"not the {header.points} points it promises")
+        if len(columns[0]) != -(-header.points // every):
+            raise ValueError(f"not the {header.points} points it promises")
     return as_points(np.stack(columns, axis=1), str(path)), fields, every
 
 
 def _header(file: Any) -> list[str]:
     """Its lines; the data begin after them."""
     lines: list[str] = []
-    for line in itertools.islice(file, 100):
-        lines.append(line.decode("utf-8").strip())
+    for _ in range(100):
+        lines.append(file.readline(_LONGEST_LINE).decode("utf-8").strip())
         if lines[-1].startswith("DATA"):
             return lines
     raise ValueError("no line DATA")
+
+
+def _check_header(pypcd4: Any, header: Any, file: Any, size: int) -> None:
+    """Compares the counts of the header with the rest of the file.
+
+    Raises:
+        ValueError: that names the count.
+    """
+    if len(set(header.fields)) != len(header.fields):
+        raise ValueError(f"two fields have one name: {' '.join(header.fields)}")
+    if header.width * header.height != header.points or header.points < 0:
+        raise ValueError(
+            f"width {header.width} times height {header.height} is not the number of "
+            f"points {header.points}"
+        )
+    if min([*header.size, *header.count, 1]) < 1:
+        raise ValueError("sizes and counts of fields must be positive")
+    if not header.points:
+        raise ValueError("it says that it has no points")
+    rest = size - file.tell()
+    num_numbers = header.points * sum(header.count)
+    num_bytes = header.points * sum(
+        a * b for a, b in zip(header.size, header.count, strict=True)
+    )
+    if header.data == pypcd4.Encoding.ASCII:
+        fits = 2 * num_numbers <= rest + 1
+    elif header.data == pypcd4.Encoding.BINARY:
+        point = num_bytes // header.points  # a whole one more is one too many
+        fits = num_bytes <= rest < num_bytes + max(point, 16)
+    else:
+        at = file.tell()
+        packed, unpacked = struct.unpack("<II", file.read(8))
+        file.seek(at)
+        # Its coder spends three bytes at least on 264.
+        fits = packed <= rest - 8 and unpacked == num_bytes <= 90 * packed
+    if not fits:
+        raise ValueError(f"{header.points} points do not fit {rest} bytes of data")
 
 
 def _columns(
@@ -67,7 +109,7 @@ def _columns(
     if header.data == pypcd4.Encoding.BINARY:
         rows = records(file, header.points, dtype, every)
     elif header.data == pypcd4.Encoding.ASCII:
-        filled = (line for line in file if line.strip())
+        filled = (line for line in byte_lines(file) if line.strip())
         lines = itertools.islice(filled, 0, None, every)
         places = [list(dtype.names).index(name) for name in names]
         return [

@@ -1,26 +1,19 @@
 """Reading point sets: one entry point that goes by the suffix of the file."""
 
-import contextlib
 import os
 import re
-import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxreg.io.errors import InputError
+from jaxreg.io.files import is_packed, open_bytes, reading, require_regular, text_lines
 from jaxreg.io.points import arrays, e57, las, meshes, pcd, ply, text
 from jaxreg.io.points.content import require_suffix
-from jaxreg.io.points.thinning import (
-    Step,
-    at_most,
-    every_row,
-    is_packed,
-    open_bytes,
-    some_lines,
-)
+from jaxreg.io.points.other_text import OF_POSES, refusal
+from jaxreg.io.points.thinning import Step, at_most, every_row, text_step
 
 
 TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
@@ -68,10 +61,10 @@ def read_points(path: str | Path) -> np.ndarray:
                [0., 1., 0.],
                [0., 0., 1.]], dtype=float32)
 
-    PLY (binary or ASCII, through plyfile), PCD, LAS, LAZ, the vertices of OBJ and STL,
-    and text files; all of these may be compressed (`.gz`). Text is separated by commas,
-    semicolons or white space, with or without a header line; the first three numeric
-    columns are taken, or both if there are two. NPY, NPZ and E57; one scan of an NPZ or
+    PLY (binary or ASCII), PCD, LAS, LAZ, the vertices of OBJ and STL, and text files;
+    all of these may be compressed (`.gz`). Text is separated by commas, semicolons or
+    white space; the columns that a header line names x, y, z are taken, without one the
+    first three of numbers, or both if there are two. NPY, NPZ and E57; one scan of an NPZ or
     E57 file that holds several is named as `FILE.npz:KEY`.
 
     Args:
@@ -83,8 +76,8 @@ def read_points(path: str | Path) -> np.ndarray:
 
     Raises:
         InputError: if the file is missing, unreadable, empty, or holds no points.
-        MissingExtraError: if the package that reads this kind is not installed: plyfile
-            of the extra `app`, or one of the extra `formats`.
+        MissingExtraError: if the package of the extra `formats` that reads this kind is
+            not installed.
     """
     bare, key = _split_key(path)
     scans = read_named(path)
@@ -132,7 +125,7 @@ def read_named(
         path: a file as for `read_points`, an archive with or without `:KEY`.
         max_points: of scans with more, every so many rows are kept. The others never
             are in memory together, but for compressed files (`.gz` that is not text,
-            `binary_compressed` PCD) and meshes of less than 100 MB.
+            `binary_compressed` PCD) and meshes that are text.
 
     Raises:
         InputError: as `read_points`.
@@ -183,22 +176,19 @@ def stem(path: str | Path) -> str:
 
 def _read_file(path: Path, max_points: int | None) -> NamedPoints:
     suffix = _suffix(path)
-    if suffix not in SUFFIXES and path.exists():
-        raise InputError(
-            f"{path}: unknown kind of file {suffix or '(no suffix)'}.\n"
-            f"Wanted {_FORMATS}."
-        )
-    require_suffix(_read_bytes(path, 16), suffix, path)
+    _require_known(path, suffix)
     if suffix in TEXT:
-        with _reading(path):
-            data, every = (
-                some_lines(path) if max_points is not None else (_read_bytes(path), 1)
-            )
-        found = NamedPoints(text.parse_text(data, path), text.columns(data), every)
+        # Of packed text always: it is unpacked in no time, but parsed in much.
+        step = text_step(path) if max_points is not None or is_packed(path) else 1
+        step = step if max_points is not None else 1
+        with reading(path, "text"):
+            points, fields = text.parse_text(text_lines(path), path, step)
+        found = NamedPoints(points, fields, step)
     else:
-        data = _read_bytes(path) if is_packed(path) else None
+        data = _unpacked(path) if is_packed(path) else None
         step = every_row if max_points is None else at_most(max_points)
-        found = NamedPoints(*_PARSERS[suffix](data, path, step))
+        with reading(path, suffix[1:].upper()):
+            found = NamedPoints(*_PARSERS[suffix](data, path, step))
     return _thinned(found, max_points)
 
 
@@ -210,31 +200,37 @@ def _thinned(scan: NamedPoints, max_points: int | None) -> NamedPoints:
 
 def _read_archive(path: Path, step: Step) -> dict[str, NamedPoints]:
     suffix = _suffix(path)
-    require_suffix(_read_bytes(path, 16), suffix, path)
-    found = _ARCHIVE_READERS[suffix](path, step)
+    _require_known(path, suffix)
+    with reading(path, suffix[1:].upper()):
+        found = _ARCHIVE_READERS[suffix](path, step)
     return {name: NamedPoints(*scan) for name, scan in found.items()}
 
 
-def _read_bytes(path: Path, limit: int = -1) -> bytes:
-    with _reading(path), open_bytes(path) as file:
-        data = file.read(limit)
-    if not data:
-        raise InputError(f"{path}: the file is empty.\nExport or copy the scan again.")
-    return data
+def _require_known(path: Path, suffix: str) -> None:
+    """Refuses what is no file of points before it is read.
 
-
-@contextlib.contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Says what is wrong with a file that cannot be read."""
-    try:
-        yield
-    except FileNotFoundError as err:
-        raise InputError(f"{path}: no such file.\nCheck the name and folder.") from err
-    except (OSError, EOFError, zlib.error) as err:
-        reason = getattr(err, "strerror", None) or "damaged gzip data"
+    Raises:
+        InputError: for no regular file, an empty one, an unknown suffix, or one that
+            the content belies.
+    """
+    require_regular(path)
+    if suffix in OF_POSES:
+        raise refusal(path, *OF_POSES[suffix])
+    if suffix not in SUFFIXES:
         raise InputError(
-            f"{path}: cannot be read ({reason}).\nCheck the file and its permissions."
-        ) from err
+            f"{path}: unknown kind of file {suffix or '(no suffix)'}.\n"
+            f"Wanted {_FORMATS}."
+        )
+    with open_bytes(path) as file:
+        start = file.read(16)
+    if not start:
+        raise InputError(f"{path}: the file is empty.\nExport or copy the scan again.")
+    require_suffix(start, suffix, path)
+
+
+def _unpacked(path: Path) -> bytes:
+    with reading(path, "gzip"), open_bytes(path) as file:
+        return file.read()
 
 
 def _split_key(path: str | Path) -> tuple[Path, str | None]:

@@ -4,94 +4,206 @@ By hand: `numpy.loadtxt` knows neither decimal commas nor empty cells, and says 
 file nor what to do.
 """
 
-import re
+import itertools
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxreg.io.errors import InputError
+from jaxreg.io.points.dialect import (
+    Dialect,
+    coordinates,
+    dialect_of,
+    is_comment,
+    is_number,
+    misread,
+)
+from jaxreg.io.points.other_text import require_points
 
 
-_COMMENT = re.compile(r"\s*($|#|//|%)")
+_LOOK = 50  # rows that the layout is read from
+Line = tuple[int, str]
 
 
-def parse_text(data: bytes, path: Path) -> np.ndarray:
-    """The points of a text file, `(n, d)` float64; `path` is for messages only.
+class _Layout(NamedTuple):
+    """What the first lines say.
 
-    The separator is read from the first line of numbers: a semicolon (then commas are
-    decimal), else a comma, else white space. Lines that start with `#`, `//` or `%` are
-    comments; one line before the numbers may be a header or a count. An empty cell is
-    NaN.
+    Attributes:
+        dialect: how a line is cut into cells.
+        columns: of the coordinates.
+        fields: names of all columns, empty if the file has none.
+        width: cells of the first row.
+        needed: cells that every row must have: up to the last column of numbers.
+        promised: rows, as a line before them says, None without one.
+    """
+
+    dialect: Dialect
+    columns: list[int]
+    fields: tuple[str, ...]
+    width: int
+    needed: int
+    promised: int | None
+
+
+def parse_text(
+    lines: Iterable[Line], path: Path, step: int = 1
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The points of a text file, `(n, d)` float64, and the names of its columns.
+
+    The separator is read from the first rows: a semicolon, else a comma or tabulators,
+    else white space; commas are decimal where they can be nothing else. Lines that
+    start with `#`, `//` or `%` are comments; before the numbers there may be a header,
+    whose names x, y, z tell the coordinates, and the number of rows. Without names the
+    first three columns of numbers are taken, or two if there are but two. An empty cell
+    is NaN.
+
+    Args:
+        lines: with their numbers in the file.
+        path: for messages only.
+        step: of so many rows one is parsed.
 
     Raises:
-        InputError: if a line does not hold the numbers that the first one promises.
+        InputError: if a row does not hold the numbers that the first ones promise, if
+            there are not as many as said, or if the file holds something else: poses,
+            a graph, a mesh.
     """
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as err:
+    lines = iter(lines)
+    first, heads = _first_lines(lines)
+    layout, first = _layout(first, heads, path)
+    rest = (line for line in lines if line[1].strip() and not is_comment(line[1]))
+    counted = _Counted(itertools.chain(first, rest))
+    kept = itertools.islice(counted, 0, None, step)
+    rows = (_parse_row(line, layout, path) for line in kept)
+    points = np.fromiter(rows, dtype=(np.float64, len(layout.columns)))
+    if layout.promised is not None and layout.promised != counted.number:
         raise InputError(
-            f"{path}: not a text file.\nGive it the suffix of its true format."
-        ) from err
-    numbered = [(k + 1, s) for k, s in enumerate(lines) if not _COMMENT.match(s)]
-    start = _first_row(numbered, path)
-    separator = _separator(numbered[start][1])
-    columns = _numeric_columns(numbered[start][1], separator)[:3]
-    rows = (_parse_row(s, separator, columns, k, path) for k, s in numbered[start:])
-    return np.fromiter(rows, dtype=(np.float64, len(columns)))
+            f"{path}: says that it has {layout.promised} points, but holds "
+            f"{counted.number}. Is it cut off?\nExport or copy the scan again."
+        )
+    return points, layout.fields
 
 
-def columns(data: bytes) -> tuple[str, ...]:
-    """The words of the header line of a text file, if it has one for every column."""
-    lines = data[:100_000].decode("utf-8-sig", errors="replace").splitlines()
-    head, *rest = [s for s in lines if not _COMMENT.match(s)][:2]
-    if not rest:
-        return ()
-    separator = _separator(rest[0])
-    words = [cell.strip() for cell in _cells(head, separator)]
-    named = len(words) == len(_cells(rest[0], separator))
-    return tuple(words) if named and not any(map(_is_number, words)) else ()
+class _Counted:
+    """An iterator that knows how many lines passed."""
+
+    def __init__(self, lines: Iterator[Line]):
+        self._lines, self.number = lines, 0
+
+    def __iter__(self) -> "_Counted":
+        return self
+
+    def __next__(self) -> Line:
+        line = next(self._lines)
+        self.number += 1
+        return line
 
 
-def _first_row(numbered: list[tuple[int, str]], path: Path) -> int:
-    for k, (_, line) in enumerate(numbered[:2]):
-        if len(_numeric_columns(line, _separator(line))) >= 2:
-            return k
-    raise InputError(
-        f"{path}: found no line with two or three numbers.\n"
-        "Wanted one point a line: x y z or x y, after at most one header line."
-    )
+def _first_lines(lines: Iterator[Line]) -> tuple[list[Line], list[str]]:
+    """The first lines that are no comments, and the comments before them."""
+    found: list[Line] = []
+    comments: list[str] = []
+    for number, line in lines:
+        if not line.strip():
+            continue
+        if not is_comment(line):
+            found.append((number, line))
+        elif not found:
+            comments.append(line.strip().lstrip("#/% "))
+        if len(found) > _LOOK:
+            break
+    return found, comments[-1:]
 
 
-def _separator(line: str) -> str | None:
-    return ";" if ";" in line else "," if "," in line else None
+def _layout(
+    lines: list[Line], heads: list[str], path: Path
+) -> tuple[_Layout, list[Line]]:
+    """What the lines say, and those that are rows."""
+    require_points([line for _, line in lines], path)
+    count: int | None = None
+    for _ in range(2):
+        start = lines[0][1].strip() if lines else ""
+        if count is None and start.isascii() and start.isdigit() and len(lines) > 1:
+            count = int(start)
+            lines = lines[1:]
+        elif lines and not _has_numbers(lines[0][1]):
+            heads = [lines[0][1].strip()]
+            lines = lines[1:]
+    if not lines or not _has_numbers(lines[0][1]):
+        raise InputError(
+            f"{path}: found no line with two or three numbers.\n"
+            "Wanted one point a line: x y z or x y, after at most one header line."
+        )
+    dialect = dialect_of([line for _, line in lines], path)
+    rows = [dialect.cells(line) for _, line in lines]
+    numeric = _numeric_columns(rows, lines, path)
+    names = dialect.cells(heads[0]) if heads else []
+    columns, fields = coordinates(names, numeric, len(rows[0]), path)
+    _require_first_row(rows, columns, lines, path)
+    needed = max(numeric) + 1
+    return _Layout(dialect, columns, fields, len(rows[0]), needed, count), lines
 
 
-def _cells(line: str, separator: str | None) -> list[str]:
-    if separator == ";":
-        line = line.replace(",", ".")
-    return line.split(separator)
+def _has_numbers(line: str) -> bool:
+    return sum(map(is_number, dialect_of([line]).cells(line))) >= 2
 
 
-def _numeric_columns(line: str, separator: str | None) -> list[int]:
-    return [k for k, cell in enumerate(_cells(line, separator)) if _is_number(cell)]
+def _numeric_columns(rows: list[list[str]], lines: list[Line], path: Path) -> list[int]:
+    """The columns of numbers, by the first row that has something there."""
+    found = []
+    for k in range(len(rows[0])):
+        cells = (row[k] for row in rows if len(row) > k and row[k])
+        cell = next(cells, "")
+        if is_number(cell):
+            found.append(k)
+        elif misread(cell):
+            raise InputError(
+                f"{path}, line {lines[0][0]}: {cell!r} is no number as it stands.\n"
+                "Write numbers with a decimal point and without other marks."
+            )
+    return found
 
 
-def _is_number(cell: str) -> bool:
+def _require_first_row(
+    rows: list[list[str]], columns: list[int], lines: list[Line], path: Path
+) -> None:
+    """Refuses a first row that is shorter than the others or has a word in it."""
+    width = len(rows[0])
+    between = range(columns[0], columns[-1]) if len(columns) > 2 else range(width)
+    words = [k for k in between if rows[0][k] and not is_number(rows[0][k])]
+    for row in rows[1:]:
+        if any(map(is_number, row[width:])) or any(is_number(row[k]) for k in words):
+            raise InputError(
+                f"{path}, line {lines[0][0]}: holds fewer numbers than the rows below "
+                f"it: {lines[0][1].strip()[:60]!r}.\nCorrect or remove the line."
+            )
+
+
+def _parse_row(line: Line, layout: _Layout, path: Path) -> list[float]:
+    number, text = line
+    cells = layout.dialect.cells(text)
     try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _parse_row(
-    line: str, separator: str | None, columns: list[int], number: int, path: Path
-) -> list[float]:
-    cells = _cells(line, separator)
-    try:
-        return [float(cells[c]) if cells[c].strip() else np.nan for c in columns]
+        if len(cells) != layout.width:
+            _require_width(cells, layout)
+        if "_" in text and any("_" in cells[c] for c in layout.columns):
+            raise ValueError
+        return [float(cells[c]) if cells[c] else np.nan for c in layout.columns]
     except (ValueError, IndexError) as err:
         raise InputError(
-            f"{path}, line {number}: wanted {len(columns)} numbers, found "
-            f"{line.strip()[:60]!r}.\nCorrect or remove the line."
+            f"{path}, line {number}: wanted {layout.width} cells with "
+            f"{len(layout.columns)} numbers, found {text.strip()[:60]!r}.\n"
+            "Correct or remove the line."
         ) from err
+
+
+def _require_width(cells: list[str], layout: _Layout) -> None:
+    """Rows may differ in words behind the numbers, not in numbers.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    if any(map(is_number, cells[layout.width :])) or not any(cells):
+        raise ValueError
+    if len(cells) < layout.needed:
+        raise ValueError

@@ -1,13 +1,14 @@
 """Every so many rows of files that hold more than is wanted."""
 
-import gzip
 import io
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+
+from jaxreg.io.files import is_packed, open_bytes
 
 
 #: From the number of rows of a file to the distance of those that are kept.
@@ -15,8 +16,8 @@ Step: TypeAlias = Callable[[int], int]
 
 # Parsed text takes some thirty times its size.
 _MOST_TEXT = 100_000_000
-_HEAD = 100
 _BLOCK = 1 << 24
+_LONGEST_LINE = 1_000_000
 _ROWS = 1_000_000  # that are read at a time
 
 
@@ -31,33 +32,25 @@ def at_most(max_points: int) -> Step:
     return lambda num: max(1, -(-num // max_points))
 
 
-def is_packed(path: Path) -> bool:
-    """Whether the name says that the file is compressed."""
-    return path.name.lower().endswith(".gz")
+def text_step(path: Path) -> int:
+    """Of how many lines of a text file one is parsed, if that is to be done soon.
 
-
-def open_bytes(path: Path) -> gzip.GzipFile | io.BufferedReader:
-    """The file, unpacked if it is compressed."""
-    return gzip.open(path) if is_packed(path) else path.open("rb")
-
-
-def some_lines(path: Path) -> tuple[bytes, int]:
-    """The first lines of a text file and every so many of the others, and how many.
-
-    A compressed file is unpacked twice, block by block: its size is not known before.
+    A compressed file is unpacked for it: its size is not known before.
 
     Raises:
-        OSError, EOFError, zlib.error: if the file cannot be read.
+        InputError: if the file cannot be read.
     """
     if is_packed(path):
         with open_bytes(path) as file:
             size = sum(map(len, iter(lambda: file.read(_BLOCK), b"")))
     else:
         size = path.stat().st_size
-    step = -(-size // _MOST_TEXT)
-    with open_bytes(path) as file:
-        head = list(itertools.islice(file, _HEAD))
-        return b"".join([*head, *itertools.islice(file, 0, None, step)]), step
+    return -(-size // _MOST_TEXT)
+
+
+def byte_lines(file: io.BufferedIOBase) -> Iterator[bytes]:
+    """Lines of an open file; one without end comes in parts, so that memory holds."""
+    return iter(lambda: file.readline(_LONGEST_LINE), b"")
 
 
 def records(file: Any, num: int, dtype: np.dtype, every: int) -> np.ndarray:

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxreg.io.errors import InputError
+from jaxreg.io.files import text_lines
 from jaxreg.io.points.read import stem
 from jaxreg.io.quaternions import motions_from_xyzw
-from jaxreg.io.rows import text_lines
 
 
 def read_conf(path: str | Path) -> dict[str, np.ndarray]:
@@ -28,7 +28,7 @@ def read_conf(path: str | Path) -> dict[str, np.ndarray]:
         InputError: if the file is missing, unreadable, or holds no pose.
     """
     poses: dict[str, np.ndarray] = {}
-    for number, line in enumerate(text_lines(path), start=1):
+    for number, line in text_lines(path):
         words = line.split()
         if words and words[0] == "bmesh":
             poses[stem(words[1])] = _pose(words[2:], f"{path}, line {number}")

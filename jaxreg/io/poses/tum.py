@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
+from jaxreg.io.files import text_lines
 from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
-from jaxreg.io.rows import text_lines
 
 
 def write_tum(
@@ -58,7 +58,7 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, Float[Array, "v 4 4"]]:
             the message names.
     """
     rows = []
-    for number, line in enumerate(text_lines(path), start=1):
+    for number, line in text_lines(path):
         words = line.split("#")[0].replace(",", " ").split()
         if not words:
             continue

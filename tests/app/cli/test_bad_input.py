@@ -52,7 +52,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "register missing": ([r, "s0.npy", "none.ply"], "none.ply"),
         "register many": ([r, "three.npz", "s0.npy"], "three.npz"),
         "graph missing": ([a, "none.g2o"], "none.g2o"),
-        "graph of scans": ([a, "scan.ply"], "scan.ply: not a text file.\nGive"),
+        "graph of scans": ([a, "scan.ply"], "scan.ply: not a text file"),
         "graph cut off": ([a, "bad.g2o"], "bad.g2o, line 1"),
     }
 
