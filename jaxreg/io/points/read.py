@@ -64,8 +64,8 @@ def read_points(path: str | Path) -> np.ndarray:
     PLY (binary or ASCII), PCD, LAS, LAZ, the vertices of OBJ and STL, and text files;
     all of these may be compressed (`.gz`). Text is separated by commas, semicolons or
     white space; the columns that a header line names x, y, z are taken, without one the
-    first three of numbers, or both if there are two. NPY, NPZ and E57; one scan of an NPZ or
-    E57 file that holds several is named as `FILE.npz:KEY`.
+    first three of numbers, or both if there are two. NPY, NPZ and E57; one scan of an
+    NPZ or E57 file that holds several is named as `FILE.npz:KEY`.
 
     Args:
         path: the file.
