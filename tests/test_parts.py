@@ -151,6 +151,16 @@ def test_an_index_is_a_class():
     assert jr.ICP(index=jr.BoxTree).index is jr.BoxTree
     with pytest.raises(TypeError, match="index: wanted the class of an index"):
         jr.ICP(index="box tree")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="ParticleFilter: index: wanted the class of"):
+        jr.ParticleFilter(index=jr.ParticleFilter)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="IndexOptions: wanted the class of an index"):
+        jr.neighbours.IndexOptions("box tree")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="method: wanted a registration method"):
+        jr.reconstruct(
+            np.zeros((2, 5, 2), np.float32),
+            key=jax.random.key(0),
+            method=jr.MotionAveraging(),  # pyright: ignore[reportArgumentType]
+        )
 
 
 def test_methods_and_keys_are_checked_when_called():

@@ -38,7 +38,13 @@ from jaxreg.local.steps import AbstractStep, GaussNewton
 from jaxreg.matching.problem import Match, Problem, match
 from jaxreg.matching.residuals import AbstractResidual, PlaneToPlane
 from jaxreg.matching.score import Score, mutual_overlap, score, score_match
-from jaxreg.neighbours import AbstractIndex, BruteForce, index_within
+from jaxreg.neighbours import (
+    AbstractIndex,
+    BruteForce,
+    IndexBuilder,
+    check_index,
+    index_within,
+)
 from jaxreg.registrar import (
     AbstractRegistrar,
     Frames,
@@ -62,7 +68,8 @@ class ICP(AbstractRegistrar):
         residual: what is made small.
         kernel: how much a residual counts.
         step: how the pose follows.
-        index: class of the index of closest points. None: for more than 1,500 points
+        index: class of the index of closest points, or `IndexOptions(VoxelTable,
+            candidates=4)`: a class with options. None: for more than 1,500 points
             the voxel table of a `CellGrid` while steps are large, then its cells, exact
             within the sample spacing; else `BruteForce`.
         max_steps: iterations at most.
@@ -98,7 +105,7 @@ class ICP(AbstractRegistrar):
     residual: AbstractResidual = eqx.field(default_factory=lambda: PlaneToPlane(0.01))
     kernel: AbstractKernel = eqx.field(default_factory=GemanMcClure)
     step: AbstractStep = eqx.field(default_factory=GaussNewton)
-    index: type[AbstractIndex] | None = eqx.field(default=None, static=True)
+    index: IndexBuilder | None = eqx.field(default=None, static=True)
     max_steps: int = eqx.field(default=60, static=True)
     max_points: int = eqx.field(default=8192, static=True)
     max_correspondence_distance: Array | float = traced(float("inf"))
@@ -116,14 +123,7 @@ class ICP(AbstractRegistrar):
             step=AbstractStep,
             adjoint=AbstractAdjoint,
         )
-        kind = self.index
-        if not (
-            kind is None or (isinstance(kind, type) and issubclass(kind, AbstractIndex))
-        ):
-            raise TypeError(
-                "ICP: index: wanted the class of an index such as BruteForce, or None, "
-                f"found {kind!r}."
-            )
+        check_index(self)
         check_counts(self, max_steps=1, max_points=1)
         check_positive(self, "max_correspondence_distance", "width_end")
         check_not_negative(self, "tolerance")

@@ -12,16 +12,17 @@ from jaxreg.graph import PoseGraph
 from jaxreg.multiview.find_slipping import slipping
 from jaxreg.multiview.find_turnable import turnable
 from jaxreg.multiview.hold_poses import Held
+from jaxreg.multiview.method import min_overlap
 from jaxreg.multiview.place import Placement, displacement, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution
-from jaxreg.particle import ParticleFilter
+from jaxreg.registrar import AbstractRegistrar
 
 
 def finish(
-    method: ParticleFilter,
+    method: AbstractRegistrar,
     averaging: AbstractAverager | None,
     scans: PreparedScans,
     motions: RelativeMotions,
@@ -30,22 +31,22 @@ def finish(
     """Averages, refines, and returns to the frames and unit of the input.
 
     Args:
-        method: its `min_overlap` tells which pairs are believed.
+        method: tells which pairs are believed.
         averaging: see `place`.
         scans: prepared scans.
         motions: of pairs, in the scans' centred frames; some may be padding.
         hold: old frames that stay, or None.
     """
-    min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
-    placement = place(motions, scans.num_scans, averaging, min_overlap)
+    least = jnp.asarray(min_overlap(method), scans.radius.dtype)
+    placement = place(motions, scans.num_scans, averaging, least)
     mode, turns = placement.mode, turnable(motions, placement)
-    placement = refine(scans, placement, averaging, min_overlap / 2)
+    placement = refine(scans, placement, averaging, least / 2)
     if hold is None:
-        free = turns | slipping(scans, placement, min_overlap)
-        return _solution(scans, motions, mode, placement, free, min_overlap)
-    placement = hold.place(scans, placement, averaging, min_overlap / 2)
-    free = (turns | slipping(scans, placement, min_overlap)) & ~hold.held
-    solution = _solution(scans, motions, mode, placement, free, min_overlap)
+        free = turns | slipping(scans, placement, least)
+        return _solution(scans, motions, mode, placement, free, least)
+    placement = hold.place(scans, placement, averaging, least / 2)
+    free = (turns | slipping(scans, placement, least)) & ~hold.held
+    solution = _solution(scans, motions, mode, placement, free, least)
     return hold.in_world(solution)
 
 
@@ -56,13 +57,13 @@ def _solution(
     mode: Int[Array, " e"],
     placement: Placement,
     free: Bool[Array, " v"],
-    min_overlap: Scalar,
+    least: Scalar,
 ) -> ReconstructionSolution:
     """In the frames and unit of the input."""
     found = motions.in_input_frames(scans)
     one = found.of_modes(mode)
     overlap, T_i_j = one.overlap[:, 0], one.T_i_j[:, 0]
-    weight = jnp.where(overlap >= min_overlap, overlap, 0)
+    weight = jnp.where(overlap >= least, overlap, 0)
     real = motions.pairs[:, 0] != motions.pairs[:, 1]
     graph = PoseGraph(found.pairs, T_i_j, weight, real, None, scans.num_scans)
     component, placed = placement.component, placement.placed

@@ -15,9 +15,10 @@ from jaxreg._core.arrays import cast_floats
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import PlaneToPlane, Problem, mutual_overlap, score_both_ways
+from jaxreg.multiview.method import follower
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
-from jaxreg.particle import ParticleFilter
+from jaxreg.registrar import AbstractRegistrar
 
 
 #: Overlap from which no search competes with a motion.
@@ -29,15 +30,15 @@ _STEPS, _POLISH = 24, 8
 
 @eqx.filter_jit
 def descended(
-    method: ParticleFilter,
+    method: AbstractRegistrar,
     scans: PreparedScans,
     pairs: Int[Array, "e 2"],
     T_i_j: Float[Array, "e D D"],
 ) -> RelativeMotions:
     """Motions by descents from guesses, in the scans' centred frames, m = 1."""
-    widest, dtype = method.width_start, T_i_j.dtype
-    coarse = LocalOptimiser(method.residual, method.kernel, method.step)
-    fine = LocalOptimiser(PlaneToPlane(0.01), method.kernel, GaussNewton())
+    dtype = T_i_j.dtype
+    coarse, widest = follower(method)
+    fine = LocalOptimiser(PlaneToPlane(0.01), coarse.kernel, GaussNewton())
     coarse, fine = cast_floats((coarse, fine), dtype)
 
     def one(row: tuple[Array, Array]) -> RelativeMotions:
@@ -61,7 +62,7 @@ def descended(
 
 
 def descended_in_input_frames(
-    method: ParticleFilter,
+    method: AbstractRegistrar,
     scans: PreparedScans,
     pair: tuple[int, int],
     T_i_j: np.ndarray,

@@ -8,10 +8,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motions, Scalar
-from jaxreg.cloud import PointCloud, centroid, median_spacing, rms_radius
+from jaxreg.cloud import Frames, PointCloud, centroid, median_spacing, rms_radius
 from jaxreg.geometry import lie
-from jaxreg.neighbours import VoxelTable
-from jaxreg.particle import ParticleFilter
+from jaxreg.multiview.method import index_of
+from jaxreg.neighbours import AbstractIndex
+from jaxreg.registrar import AbstractRegistrar
 
 
 # A scan this many times larger or smaller than the median is in another unit.
@@ -24,7 +25,7 @@ class PreparedScans(eqx.Module):
     Attributes:
         clouds: `(v, n, d)` thinned points with normals; the unit is `radius`. With what
             was seen from the viewpoints, where these are given.
-        tables: their voxel tables.
+        tables: their indexes.
         mean: `(v, d)` centroid of each scan in its input frame.
         radius: the median root mean square radius of the scans, in the input's unit.
         spacing: `(v,)` distance between thinned points, in units of `radius`.
@@ -35,7 +36,7 @@ class PreparedScans(eqx.Module):
     """
 
     clouds: PointCloud
-    tables: VoxelTable
+    tables: AbstractIndex
     mean: Float[Array, "v d"]
     radius: Scalar
     spacing: Float[Array, " v"]
@@ -61,9 +62,13 @@ class PreparedScans(eqx.Module):
         """One scan's thinned points."""
         return jax.tree.map(lambda x: x[i], self.clouds)
 
-    def table(self, i: Int[Array, ""]) -> VoxelTable:
+    def table(self, i: Int[Array, ""]) -> AbstractIndex:
         """One scan's index."""
         return jax.tree.map(lambda x: x[i], self.tables)
+
+    def frames(self, i: Int[Array, ""], j: Int[Array, ""]) -> Frames:
+        """Those of scan j as the source and scan i as the target."""
+        return Frames(self.mean[j], self.mean[i], self.radius)
 
     def to_input_frames(
         self, T_i_j: Motions, i: Int[Array, "*b"], j: Int[Array, "*b"]
@@ -101,21 +106,22 @@ def common_radius(points: Float[Array, "v n d"], mask: Bool[Array, "v n"]) -> Sc
 
 
 def prepare_scan(
-    method: ParticleFilter,
+    method: AbstractRegistrar,
     points: Float[Array, "n d"],
     mask: Bool[Array, " n"],
     radius: Scalar,
-) -> tuple[PointCloud, VoxelTable, Float[Array, " d"], Scalar]:
+) -> tuple[PointCloud, AbstractIndex, Float[Array, " d"], Scalar]:
     """One scan: cloud, table, centroid and spacing."""
     mean = centroid(points, mask)
+    method = method.in_frames(Frames(mean, mean, radius))
     cloud = method.prepare((points - mean) / radius, mask)
-    table = VoxelTable.build(cloud.points, cloud.mask)
+    table = index_of(method, cloud)
     return cloud, table, mean, median_spacing(cloud.points, cloud.mask)
 
 
 @eqx.filter_jit
 def prepare_scans(
-    method: ParticleFilter,
+    method: AbstractRegistrar,
     points: Float[Array, "v n d"],
     mask: Bool[Array, "v n"],
     viewpoints: Float[Array, "v d"] | None = None,

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxreg._core.checks import check_instance, check_key, is_concrete, told
+from jaxreg._core.checks import check_instance, check_key, is_concrete
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
@@ -23,13 +23,14 @@ from jaxreg.multiview.register_pairs import OnPairs, Rounds
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.particle import ParticleFilter
+from jaxreg.registrar import AbstractRegistrar
 
 
 def reconstruct(
     scans: object,
     *,
     key: Key,
-    method: ParticleFilter | None = None,
+    method: AbstractRegistrar | None = None,
     averaging: AbstractAverager | None = None,
     mask: object = None,
     viewpoints: object = None,
@@ -49,7 +50,8 @@ def reconstruct(
         scans: a list of `(n_i, d)` point sets, or a padded array `(v, n, d)`. Of a
             scan in a list that has more than 524,288 points so many are drawn.
         key: a `jax.random.key`; the same key gives the same answer.
-        method: the search between pairs, `ParticleFilter()` by default.
+        method: registers pairs, `ParticleFilter()` by default; any method of `register`
+            does. Of an `AbstractIndexedRegistrar` several modes of a pair are kept.
         averaging: how relative motions become poses; None for `Correntropy` from the
             spanning tree of largest overlap.
         mask: `(v, n)` True for valid points, for a padded array only.
@@ -91,10 +93,7 @@ def reconstruct(
     eyes = checked_viewpoints(viewpoints, points, row_mask)
     points, eyes = jax.lax.stop_gradient((points, eyes))
     method = ParticleFilter() if method is None else method
-    if not isinstance(method, ParticleFilter):
-        raise TypeError(
-            f"method: wanted a ParticleFilter, found {told(method, ParticleFilter)}."
-        )
+    check_instance(method, "method", AbstractRegistrar)
     check_instance(averaging, "averaging", AbstractAverager | None)
     if hold_previous and not isinstance(previous, ReconstructionSolution):
         raise ValueError(

@@ -16,14 +16,11 @@ from jaxreg.geometry import lie
 from jaxreg.matching import Problem, score
 from jaxreg.multiview.choose_pairs import Order, first_pairs, most_pairs, next_pairs
 from jaxreg.multiview.follow_sequence import SURE, descended_in_input_frames
+from jaxreg.multiview.method import min_overlap, num_kept
 from jaxreg.multiview.place import Placement, believed, place
 from jaxreg.multiview.prepare import PreparedScans
-from jaxreg.multiview.relative_motions import (
-    RelativeMotions,
-    num_kept,
-    relative_motions,
-)
-from jaxreg.particle import ParticleFilter
+from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
+from jaxreg.registrar import AbstractRegistrar
 
 
 # What a run keeps: motions of pairs as they are found, in the input's frames.
@@ -48,7 +45,7 @@ class Rounds:
 
     def __init__(
         self,
-        method: ParticleFilter,
+        method: AbstractRegistrar,
         averaging: AbstractAverager | None,
         scans: PreparedScans,
         key: Key,
@@ -174,14 +171,14 @@ class Rounds:
 
 @eqx.filter_jit
 def _prospects(
-    method: ParticleFilter,
+    method: AbstractRegistrar,
     averaging: AbstractAverager | None,
     scans: PreparedScans,
     motions: RelativeMotions,
 ) -> tuple[Placement, Float[Array, "v v"]]:
     """Present poses, and the share of scan j that is near scan i by them, i < j."""
-    min_overlap = jnp.asarray(method.min_overlap, scans.radius.dtype)
-    found = place(motions, scans.num_scans, averaging, min_overlap)
+    least = jnp.asarray(min_overlap(method), scans.radius.dtype)
+    found = place(motions, scans.num_scans, averaging, least)
     T, spacing = found.T_world_i, _DRIFT * scans.coarsest
 
     def share(pair: Array) -> Array:

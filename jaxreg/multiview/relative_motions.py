@@ -7,18 +7,15 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.brief import BriefModule
+from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
+from jaxreg.multiview.method import num_kept, solve
 from jaxreg.multiview.prepare import PreparedScans
-from jaxreg.particle import ParticleFilter
+from jaxreg.registrar import AbstractRegistrar
 
 
-# Modes of a pair that are kept; most pairs have no second one.
-_MOST_MODES = 4
-
-
-def num_kept(method: ParticleFilter) -> int:
-    """Modes of a pair that `relative_motions` keeps, m."""
-    return min(_MOST_MODES, method.num_modes)
+# What such a solution says of the scans is not said of the pose that it returns.
+_NO_POSE = Status.TOO_FEW_POINTS, Status.NON_FINITE, Status.DIVERGED
 
 
 class RelativeMotions(BriefModule):
@@ -110,7 +107,7 @@ class RelativeMotions(BriefModule):
 
 @eqx.filter_jit
 def relative_motions(
-    method: ParticleFilter,
+    method: AbstractRegistrar,
     scans: PreparedScans,
     pairs: Int[Array, "e 2"],
     key: Key,
@@ -124,21 +121,23 @@ def relative_motions(
 
     def one(pair: Array) -> RelativeMotions:
         i, j = pair
-        solution = method.solve_indexed(
-            scans.cloud(j),
-            scans.cloud(i),
-            scans.table(j),
-            scans.table(i),
-            None,
+        solution = solve(
+            method,
+            scans.frames(i, j),
+            (scans.cloud(j), scans.cloud(i)),
+            (scans.table(j), scans.table(i)),
             jax.random.fold_in(jax.random.fold_in(key, i), j),
         )
-        usable = scans.usable[i] & scans.usable[j]
         modes = jax.tree.map(lambda x: x[: num_kept(method)], solution.modes)
+        T, usable = modes.T_target_source, scans.usable[i] & scans.usable[j]
+        for status in _NO_POSE:
+            usable = usable & (solution.status != status)
+        sound = usable & jnp.all(jnp.isfinite(T), axis=(1, 2))
         return RelativeMotions(
             pair,
-            modes.T_target_source,
-            jnp.where(usable, modes.overlap, 0),
-            modes.inlier_rmse,
+            jnp.where(sound[:, None, None], T, jnp.eye(T.shape[-1], dtype=T.dtype)),
+            jnp.where(sound, modes.overlap, 0),
+            jnp.where(sound, modes.inlier_rmse, 0),
         )
 
     return lax.map(one, pairs)

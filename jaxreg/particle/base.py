@@ -22,13 +22,19 @@ from jaxreg._core.typing import Key, Mask, Motion, Points
 from jaxreg.cloud import PointCloud, levelled, thin, without_noise
 from jaxreg.local import AbstractStep, LocalOptimiser
 from jaxreg.matching import AbstractResidual, Problem
-from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
+from jaxreg.neighbours import (
+    AbstractIndex,
+    BruteForce,
+    IndexBuilder,
+    VoxelTable,
+    check_index,
+)
 from jaxreg.particle.conclude import Pair, conclude
 from jaxreg.particle.energies import AbstractEnergy
 from jaxreg.particle.priors import AbstractPrior, GaussianPrior, UniformPrior
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import (
-    AbstractRegistrar,
+    AbstractIndexedRegistrar,
     Frames,
     RegistrationSolution,
     SearchTrace,
@@ -59,7 +65,7 @@ class Found(eqx.Module):
     trace: SearchTrace | None = None
 
 
-class AbstractSearch(AbstractRegistrar):
+class AbstractSearch(AbstractIndexedRegistrar):
     """A registration method that needs no initial guess: many poses, few points."""
 
     prior: eqx.AbstractVar[AbstractPrior | None]
@@ -70,9 +76,8 @@ class AbstractSearch(AbstractRegistrar):
     width_start: eqx.AbstractVar[Array | float]
     width_end: eqx.AbstractVar[Array | float]
     tolerance: eqx.AbstractVar[Array | float]
-    min_overlap: eqx.AbstractVar[Array | float]
     num_points: eqx.AbstractVar[int]
-    num_modes: eqx.AbstractVar[int]
+    index: eqx.AbstractVar[IndexBuilder | None]
     refine_steps: eqx.AbstractVar[int]
     max_points: eqx.AbstractVar[int]
     batch_size: eqx.AbstractVar[int]
@@ -87,6 +92,7 @@ class AbstractSearch(AbstractRegistrar):
             step=AbstractStep,
             energy=AbstractEnergy,
         )
+        check_index(self)
         check_counts(self, num_points=1, num_modes=1, max_points=1, batch_size=1)
         check_counts(self, refine_steps=0)
         check_positive(self, "width_start", "width_end")
@@ -141,13 +147,17 @@ class AbstractSearch(AbstractRegistrar):
         self, source: PointCloud, target: PointCloud
     ) -> tuple[AbstractIndex, AbstractIndex]:
         """Of source and target."""
+        if self.index is not None:
+            return on_both(self.index_of, *levelled(source, target))
         if len(source.mask) <= _FEW:  # compared in less time than a table is filled in
             source_index = BruteForce.build(source.points, source.mask)
             return source_index, VoxelTable.build(target.points, target.mask)
-        return on_both(
-            lambda cloud: VoxelTable.build(cloud.points, cloud.mask),
-            *levelled(source, target),
-        )
+        return on_both(self.index_of, *levelled(source, target))
+
+    def index_of(self, cloud: PointCloud) -> AbstractIndex:
+        """Of the kind asked for; a voxel table if none is."""
+        kind = VoxelTable if self.index is None else self.index
+        return kind.build(cloud.points, cloud.mask)
 
     def solve_indexed(
         self,
@@ -156,14 +166,14 @@ class AbstractSearch(AbstractRegistrar):
         source_index: AbstractIndex,
         target_index: AbstractIndex,
         init: Motion | None,
-        key: Key,
+        key: Key | None,
     ) -> RegistrationSolution:
         """`solve` with indexes built before, for clouds that enter many pairs."""
         # Nothing is differentiated: the loops of a search know no reverse mode.
         self, source, target, init = lax.stop_gradient(
             (cast_floats(self, source.points.dtype), source, target, init)
         )
-        key_points, key_search = jax.random.split(key)
+        key_points, key_search = jax.random.split(check_key(key))
         pair = Pair(source, target, source_index, target_index)
         few = _some_points(key_points, pair.problem, self.num_points)
         found = self.search(key_search, few, init)

@@ -30,6 +30,7 @@ from jaxreg._core.checks import (
 from jaxreg._core.typing import Key, Motion
 from jaxreg.local import AbstractStep, GaussNewton
 from jaxreg.matching import AbstractResidual, PointToPlane, Problem
+from jaxreg.neighbours import IndexBuilder
 from jaxreg.particle.base import Found
 from jaxreg.particle.draw import SETTLE_STEPS, most_look_ups, with_settled
 from jaxreg.particle.dynamics import AbstractDynamics, StochasticDynamics
@@ -69,6 +70,9 @@ class ParticleFilter(AbstractFilter):
         resampler: how they are replaced, and when.
         energy: what they are weighed by.
         residual, kernel, step: parts of the local optimiser.
+        index: what is asked for closest points: a class such as `BoxTree`, or
+            `IndexOptions(VoxelTable, candidates=4)`. None: a `VoxelTable` with one
+            candidate a cell.
         sample_share: effective sample size asked of the likelihoods, as a share of the
             particles (at t = 0 of those that are to be carried on, at most all).
         prior_error_share: how much of the motion error of t = 0 the dynamics see. It
@@ -106,6 +110,7 @@ class ParticleFilter(AbstractFilter):
     residual: AbstractResidual = eqx.field(default_factory=lambda: PointToPlane(0.2))
     kernel: AbstractKernel = eqx.field(default_factory=GemanMcClure)
     step: AbstractStep = eqx.field(default_factory=GaussNewton)
+    index: IndexBuilder | None = eqx.field(default=None, static=True)
     sample_share: Array | float = traced(0.98)
     prior_error_share: Array | float = traced(0.25)
     width_start: Array | float = traced(0.3)

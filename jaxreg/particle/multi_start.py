@@ -11,6 +11,7 @@ from jaxreg._core.checks import check_counts
 from jaxreg._core.typing import Key, Motion
 from jaxreg.local import AbstractStep, GaussNewton, decoupled_error
 from jaxreg.matching import AbstractResidual, PointToPlane, Problem, match
+from jaxreg.neighbours import IndexBuilder
 from jaxreg.particle.base import AbstractSearch, Found
 from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy
 from jaxreg.particle.priors import AbstractPrior, GivenParticles
@@ -31,8 +32,8 @@ class MultiStart(AbstractSearch):
         num_steps: local steps from each.
         refine_steps, num_points, num_modes, max_points, batch_size: as in
             `ParticleFilter`.
-        prior, energy, residual, kernel, step: as there. The energy ranks the ends, of
-            which a mode's weight is its share.
+        prior, energy, residual, kernel, step, index: as there. The energy ranks the
+            ends, of which a mode's weight is its share.
         width_start, width_end: kernel width at the first and at the last step.
         tolerance: descents have come to rest where the last step moves none by more
             than this many radians and radii.
@@ -57,6 +58,7 @@ class MultiStart(AbstractSearch):
     residual: AbstractResidual = eqx.field(default_factory=lambda: PointToPlane(0.2))
     kernel: AbstractKernel = eqx.field(default_factory=GemanMcClure)
     step: AbstractStep = eqx.field(default_factory=GaussNewton)
+    index: IndexBuilder | None = eqx.field(default=None, static=True)
     width_start: Array | float = traced(0.3)
     width_end: Array | float = traced(0.06)
     tolerance: Array | float = traced(1e-4)

@@ -11,6 +11,7 @@ from jaxtyping import Array
 import jaxreg as jr
 from jaxreg._core.arrays import traced
 from jaxreg.local import LocalOptimiser
+from jaxreg.neighbours import IndexOptions
 from jaxreg.particle import (
     AbstractResampler,
     GivenParticles,
@@ -145,3 +146,18 @@ def test_a_filter_that_is_sure_terminates_at_once():
     assert shift < 5
     with pytest.raises(ValueError, match="source: wanted shape"):
         method.iteration(SOURCE[None], TARGET[None], key=KEY)
+
+
+def test_a_filter_takes_any_index_with_options():
+    options = IndexOptions(jr.VoxelTable, resolution=64, candidates=4)
+    method = jr.ParticleFilter(index=options)
+    index = method.iteration(SOURCE, TARGET, key=KEY).problem.index
+    assert isinstance(index, jr.VoxelTable)
+    assert (index.resolution, index.candidates) == (64, 4)
+    # Equal ones are one static field: nothing compiles again.
+    again = IndexOptions(jr.VoxelTable, candidates=4, resolution=64)
+    assert hash(again) == hash(options)
+    assert again == options != IndexOptions(jr.VoxelTable)
+    assert repr(again) == "IndexOptions(VoxelTable, candidates=4, resolution=64)"
+    with pytest.raises(TypeError, match=r"VoxelTable has the options .* found 'cells'"):
+        IndexOptions(jr.VoxelTable, cells=4)

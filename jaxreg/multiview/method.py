@@ -1,0 +1,67 @@
+"""What the pipeline asks of a method of registration, beyond its contract."""
+
+from jaxtyping import Array
+
+from jaxreg._core.typing import Key, Scalar
+from jaxreg.cloud import Frames, PointCloud
+from jaxreg.local import GaussNewton, LocalOptimiser
+from jaxreg.matching import PointToPlane
+from jaxreg.neighbours import AbstractIndex, VoxelTable
+from jaxreg.particle import AbstractSearch
+from jaxreg.registrar import (
+    AbstractIndexedRegistrar,
+    AbstractRegistrar,
+    RegistrationSolution,
+)
+from jaxreg.robust import GemanMcClure
+
+
+# Modes of a pair that are kept; most pairs have no second one.
+_MOST_MODES = 4
+# Of methods that do not say: the least overlap that is believed, and the kernel width
+# of the first step, in radii, those of `ParticleFilter()`.
+_MIN_OVERLAP, _WIDEST = 0.1, 0.3
+
+
+def num_kept(method: AbstractRegistrar) -> int:
+    """Modes of a pair that `relative_motions` keeps, m."""
+    if isinstance(method, AbstractIndexedRegistrar):
+        return min(_MOST_MODES, method.num_modes)
+    return 1
+
+
+def min_overlap(method: AbstractRegistrar) -> Array | float:
+    """The least overlap of a pose that is believed."""
+    if isinstance(method, AbstractIndexedRegistrar):
+        return method.min_overlap
+    return _MIN_OVERLAP
+
+
+def index_of(method: AbstractRegistrar, cloud: PointCloud) -> AbstractIndex:
+    """The index of a scan, for the method and for what follows it."""
+    if isinstance(method, AbstractIndexedRegistrar):
+        return method.index_of(cloud)
+    return VoxelTable.build(cloud.points, cloud.mask)
+
+
+def solve(
+    method: AbstractRegistrar,
+    frames: Frames,
+    clouds: tuple[PointCloud, PointCloud],
+    indexes: tuple[AbstractIndex, AbstractIndex],
+    key: Key,
+) -> RegistrationSolution:
+    """Registers the first of two prepared scans to the second."""
+    method = method.in_frames(frames)
+    if isinstance(method, AbstractIndexedRegistrar):
+        return method.solve_indexed(*clouds, *indexes, None, key)
+    return method.solve(*clouds, None, key)
+
+
+def follower(method: AbstractRegistrar) -> tuple[LocalOptimiser, Scalar | float]:
+    """The local optimiser of descents from a guess, and its first kernel width."""
+    if isinstance(method, AbstractSearch):
+        parts = method.residual, method.kernel, method.step
+        return LocalOptimiser(*parts), method.width_start
+    parts = PointToPlane(0.2), GemanMcClure(), GaussNewton()
+    return LocalOptimiser(*parts), _WIDEST
