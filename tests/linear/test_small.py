@@ -97,3 +97,17 @@ def test_least_norm_solutions_are_those_of_the_pseudoinverse():
         x = solve(jnp.asarray(A), jnp.asarray(b))
     expected = np.einsum("bij,bj->bi", np.linalg.pinv(A, rcond=1e-10), b)
     np.testing.assert_allclose(x, expected, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_direction_that_is_free_up_to_rounding_gets_nothing(dtype):
+    rng = np.random.default_rng(0)
+    root, x = rng.normal(size=(50, 6, 5)), rng.normal(size=(50, 6))
+    A = (root @ root.swapaxes(1, 2)).astype(dtype)  # of rank five
+    with jax.enable_x64(True):
+        b = np.einsum("bij,bj->bi", A, x).astype(dtype)
+        found = np.asarray(small.solve_semidefinite(jnp.asarray(A), jnp.asarray(b)))
+    # Rounding grows with the condition of the rest: a few pivots stand out of it.
+    assert np.mean(found[:, -1] == 0) > 0.8
+    left = np.einsum("bij,bj->bi", A, found) - b
+    assert np.abs(left).max() < 1e5 * np.finfo(dtype).eps
