@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 from jaxreg._core.status import Status
 from jaxreg.averaging import MotionAveraging, average, pose_covariances
 from jaxreg.averaging.base import length_scale
-from jaxreg.averaging.covariance import COVARIANCE_LIMIT
+from jaxreg.averaging.covariance import COVARIANCE_LIMIT, _deviations
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import motions, random_graph, rotations
 
@@ -136,6 +136,17 @@ def test_covariances_without_information_are_those_of_the_errors_made():
             np.einsum("va,vab,vb->v", error, np.linalg.inv(covariance), error)
         )
     assert 2.3 < np.mean(ratios) < 4.5  # 3 unknowns; plain averaging is not optimal
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_deviations_are_those_of_the_noise_of_one_component(d):
+    rng = np.random.default_rng(d)
+    noise = motions(rotations(rng, 3000, d, 0.01), 0.05 * rng.normal(size=(3000, d)))
+    edges = np.tile([0, 1], (3000, 1))
+    graph = PoseGraph.from_edges(edges, noise.astype(np.float32))
+    poses = jnp.broadcast_to(jnp.eye(d + 1), (2, d + 1, d + 1))
+    found = _deviations(graph, poses, jnp.ones(3000))
+    np.testing.assert_allclose(found, [0.05, 0.01], rtol=0.05)
 
 
 def test_covariances_refuse_large_graphs_and_mark_loose_frames():

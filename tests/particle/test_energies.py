@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 
 from jaxreg.cloud import PointCloud
 from jaxreg.local import GaussNewton, LocalOptimiser, decoupled_error
+from jaxreg.local.steps import AbstractStep
 from jaxreg.matching import PointToPoint, Problem, match
 from jaxreg.neighbours import BruteForce
 from jaxreg.particle import (
@@ -19,7 +20,7 @@ from jaxreg.particle import (
 )
 from jaxreg.particle.measure import measure
 from jaxreg.particle.modes import distinct_modes, first_within
-from jaxreg.robust import L2
+from jaxreg.robust import L2, AbstractKernel
 
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -100,6 +101,40 @@ def test_measurement_descends_and_reports_what_it_moved():
     np.testing.assert_allclose(out.motion_error, moved, atol=1e-6)
     best = np.argmin(out.energy)
     np.testing.assert_array_equal(out.measurement, out.T_target_source[best])
+
+
+class _Width(AbstractKernel):
+    def rho(self, sq_residual, width):
+        return 0 * sq_residual
+
+    def weight(self, sq_residual, width):
+        return width + 0 * sq_residual
+
+    def width_of(self, sq_residual, mask):
+        return sq_residual[0]
+
+
+class _ByWeight(AbstractStep):
+    def __call__(self, T_target_source, match, weight, residual):
+        return T_target_source.at[0, 3].add(jnp.max(weight))
+
+
+@pytest.mark.parametrize("num_steps", [1, 2, 5])
+def test_kernel_widths_go_from_the_first_to_the_last_by_one_factor(num_steps):
+    T = jnp.eye(4)[None]
+    out = measure(
+        _problem(),
+        LocalOptimiser(PointToPoint(), _Width(), _ByWeight()),
+        SquaredEnergy(),
+        Particles.at(T, 1),
+        T,
+        (jnp.asarray(0.8), jnp.asarray(0.05)),
+        num_rows=1,
+        num_steps=num_steps,
+        batch_size=1,
+    )
+    shift = np.geomspace(0.8, 0.05, num_steps).sum()
+    np.testing.assert_allclose(out.motion_error[0, 0], shift, rtol=1e-5)
 
 
 def test_modes_are_distinct_best_first_and_share_the_weight():
