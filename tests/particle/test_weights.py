@@ -61,3 +61,20 @@ def test_products_of_weights_do_not_underflow():
     np.testing.assert_allclose(weight, expected / expected.sum(), rtol=1e-5)
     none = normalised(jnp.full(3, -jnp.inf), jnp.asarray([True, True, False]))
     np.testing.assert_allclose(np.exp(none), [0.5, 0.5, 0], rtol=1e-6)
+
+
+def test_the_mean_likelihood_is_that_of_all_particles_in_use():
+    rng = np.random.default_rng(0)
+    energy, weight = 1 + rng.random(P), rng.random(P) * (np.arange(P) % 3 > 0)
+    energy[4] = np.inf
+    array = jnp.asarray(energy, jnp.float32)
+    found = likelihood(array, P / 2)
+    low, high = np.argsort(energy)[[0, 40]]
+    relative = np.asarray(found.relative, float)
+    temperature = (energy[low] - energy[high]) / (relative[high] - relative[low])
+    assert float(found.best) == pytest.approx(-energy[low] / temperature, rel=1e-4)
+    some = (np.arange(P) != 4) & (weight > 0)
+    expected = np.average(np.exp(-energy / temperature)[some], weights=weight[some])
+    log_weight = jnp.where(weight > 0, jnp.log(jnp.maximum(weight, 1e-9)), -jnp.inf)
+    log_mean = found.log_mean(log_weight.astype(jnp.float32))
+    assert float(log_mean) == pytest.approx(np.log(expected), rel=1e-4)
