@@ -89,6 +89,27 @@ def _check_header(file: io.BufferedIOBase, size: int) -> None:
     packed = bool(kind & 0x80)
     if point < _POINT or num_points * point > room * (_MOST_RATIO if packed else 1):
         raise ValueError(f"{num_points} points of {point} bytes in {room} bytes")
+    if packed and num_points:
+        _check_chunks(file, start, size, num_points)
     # A few bytes behind the points are usual, a whole point is not.
     if not packed and room - num_points * point >= point:
         raise ValueError(f"{num_points} points promised, more are there")
+
+
+def _check_chunks(file: io.BufferedIOBase, start: int, size: int, num: int) -> None:
+    """Compares the table of chunks of a LAZ file with its size.
+
+    Raises:
+        ValueError: if it cannot lie in the file.
+    """
+    file.seek(start)
+    (table,) = struct.unpack("<q", file.read(8))
+    if table == -1:  # written to a stream: the place stands at the end
+        file.seek(size - 8)
+        (table,) = struct.unpack("<q", file.read(8))
+    if not start + 8 <= table <= size - 8:
+        raise ValueError(f"its table of chunks is to begin at byte {table} of {size}")
+    file.seek(table)
+    _, chunks = struct.unpack("<II", file.read(8))
+    if chunks > num:
+        raise ValueError(f"{chunks} chunks of {num} points")

@@ -1,0 +1,92 @@
+"""Damaged files of every format: `python -m tests.fuzz --cases 5000`.
+
+Each case is read in a child process with 10 s and 1 GB; it must end in arrays or in one
+message. `--only N` shows one case again.
+"""
+
+import argparse
+import collections
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.fuzz.mutations import Damaged
+
+
+ROOT = Path(__file__).parents[2]
+BATCH = 1000
+ENDS = ("tracebacks", "hangs", "over memory", "silent")
+
+
+def run(seed: int, start: int, stop: int) -> list[tuple[str, str]]:
+    """The ends of the cases of a range, each with the case in words."""
+    ends: list[tuple[str, str]] = []
+    while start < stop:
+        last, found, code = _batch(seed, start, min(start + BATCH, stop))
+        ends += found
+        if last is not None:
+            hung = code == -signal.SIGALRM
+            ends.append(("hang" if hung else f"traceback: died by {-code}", last))
+        start += len(found) + (last is not None)
+    return ends
+
+
+def _batch(
+    seed: int, start: int, stop: int
+) -> tuple[str | None, list[tuple[str, str]], int]:
+    """The case that a child died of, the ends of those before, and its exit code."""
+    words = [sys.executable, "-m", "tests.fuzz.worker", *map(str, (seed, start, stop))]
+    child = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    begun, ends = None, []
+    for line in map(json.loads, child.stdout.splitlines()):
+        if "how" in line:
+            begun = f"case {line['case']} ({line['kind']}, {line['how']})"
+        else:
+            ends.append((line["end"], str(begun)))
+            begun = None
+    if begun is None and len(ends) < stop - start:
+        raise RuntimeError(f"the child ended outside a case:\n{child.stderr[-2000:]}")
+    return begun, ends, child.returncode
+
+
+def summary(ends: list[tuple[str, str]]) -> str:
+    """`N cases: 0 tracebacks, 0 hangs, 0 over memory, 0 silent`."""
+    of = collections.Counter(end.split(":")[0] for end, _ in ends)
+    numbers = (of["traceback"], of["hang"], of["over memory"], of["silent"])
+    parts = (f"{num} {name}" for num, name in zip(numbers, ENDS, strict=True))
+    return f"{len(ends)} cases: {', '.join(parts)}"
+
+
+def show(seed: int, number: int) -> Damaged:
+    """Writes the file of a case beside the working folder's others."""
+    from tests.fuzz.samples import samples
+    from tests.fuzz.worker import case
+
+    _, made = case(seed, number, samples())
+    Path(f"case-{made.name}").write_bytes(made.data)
+    return made
+
+
+def main() -> int:
+    """Runs the command; 1 if any case ended badly."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument("--cases", type=int, default=5000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", type=int, help="write the file of this case")
+    options = parser.parse_args()
+    if options.only is not None:
+        made = show(options.seed, options.only)
+        print(f"case-{made.name}: {made.how}")  # noqa: T201
+        return 0
+    ends = run(options.seed, 0, options.cases)
+    bad = [(end, what) for end, what in ends if end not in ("read", "refused")]
+    for end, what in bad[:40]:
+        print(f"{what}: {end}")  # noqa: T201
+    print(summary(ends))  # noqa: T201
+    return int(bool(bad))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
