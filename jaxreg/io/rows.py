@@ -43,7 +43,7 @@ def ids(path: str | Path, line: Line, wanted: int) -> list[int]:
     number, words = line
     found = []
     for word in words[:wanted]:
-        if not (word.isascii() and word.isdigit()):
+        if not (word.isascii() and word.isdigit() and len(word) < 19):
             raise InputError(f"{path}, line {number}: {word!r} is not an integer id.")
         found.append(int(word))
     return found

@@ -56,7 +56,7 @@ def flip(rng: np.random.Generator, name: str, data: bytes) -> Damaged:
     out = bytearray(data)
     for _ in range(rng.integers(1, 9)):
         at = int(len(out) * rng.random() ** rng.integers(1, 4))
-        out[at] = rng.choice([0, 255, 10, 32, 45, rng.integers(256)])
+        out[at] = rng.choice(np.array([0, 255, 10, 32, 45, rng.integers(256)]))
     return Damaged(name, bytes(out), "bytes flipped")
 
 

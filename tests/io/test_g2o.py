@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.graph import PoseGraph
+from jaxreg.graph.pose_graph import chordal_weights
 from jaxreg.io.errors import InputError
 from jaxreg.io.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
 from tests.helpers import data_dir
@@ -105,6 +106,22 @@ def test_unknown_lines_are_counted_and_warned_of(tmp_path):
         assert read_g2o(path).num_edges == 2
 
 
+def test_of_indefinite_information_the_nearest_is_taken(tmp_path):
+    path = tmp_path / "a.g2o"
+    good = "EDGE_SE2 0 1 1 0 0 4 1 0 3 0 2\n"
+    path.write_text(good + "EDGE_SE2 1 2 1 0 0 2 3 0 2 0 5\n" + good)
+    with pytest.warns(UserWarning, match="1 of 3 edges have an indefinite"):
+        graph = read_g2o(path)
+    assert graph.information is not None
+    expected = [[[4, 1, 0], [1, 3, 0], [0, 0, 2]], [[2.5, 2.5, 0], [2.5, 2.5, 0]]]
+    np.testing.assert_array_equal(graph.information[0], expected[0])
+    np.testing.assert_allclose(graph.information[1, :2], expected[1], atol=1e-5)
+    np.testing.assert_allclose(graph.information[1, 2], [0, 0, 5], atol=1e-6)
+    kappa, tau = chordal_weights(graph)
+    assert np.isfinite(kappa).all()
+    assert np.asarray(tau)[1] > 0
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -116,7 +133,7 @@ def test_unknown_lines_are_counted_and_warned_of(tmp_path):
         ("EDGE_SE2 0 1 1 0 a 1 0 0 1 0 1\n", "line 1: 'a' is not a number"),
         ("EDGE_SE2 0 1 1 0 nan 1 0 0 1 0 1\n", "line 1: .* not finite"),
         ("FIX 0\nEDGE_SE2 4 4 1 0 0 1 0 0 1 0 1\n", "line 2: .*with itself"),
-        ("EDGE_SE2 0 1 1 0 0 1 0 0 -1 0 1\n", "line 1: .*indefinite"),
+        ("EDGE_SE2 0 1 1 0 0 -1 0 0 -1 0 -1\n", "line 1: .*indefinite"),
         ("VERTEX_SE2 0 0 0 0\n", "holds no EDGE"),
         (
             f"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 0 {INFO3}\n",

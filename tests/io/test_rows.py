@@ -91,6 +91,11 @@ EYE = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
         (read_toro, "VERTEX2 0 0 0 0\n", "no EDGE2 or EDGE3 line"),
         (read_toro, "EDGE2 0 1 1 2\n", "line 1: EDGE2 wants 11 numbers, found 4"),
         (read_toro, "EDGE4 0 1\n", "line 1: 'EDGE4' is no kind of line"),
+        (
+            read_toro,
+            f"EDGE2 {'9' * 30} 1 1 2 3 1 0 1 1 0 0\n",
+            "line 1: '9+' is not an integer id",
+        ),
         (read_toro, "EDGE2 a 1 1 2 3 1 0 1 1 0 0\n", "line 1: not numbers alone"),
         (read_toro, "EDGE2 0 1 1 2 3 -1 0 1 1 0 0\n", "line 1: .*indefinite"),
     ],

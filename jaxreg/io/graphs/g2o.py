@@ -21,6 +21,7 @@ from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 from jaxreg.io.files import text_lines
+from jaxreg.io.graphs.information import nearest_semidefinite
 from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
 
 
@@ -53,8 +54,9 @@ def read_g2o(path: str | Path) -> PoseGraph:
     Returns:
         The graph, with information matrices. Its frames are the ids of the file in
         increasing order, see `read_g2o_poses`; FIX lines are not needed, as frame 0 is
-        the one that stays. Lines of unknown kinds are skipped, with one warning that
-        counts them.
+        the one that stays. Lines of unknown kinds are skipped, and for indefinite
+        information matrices the nearest positive semidefinite ones are taken; a
+        warning counts either.
 
     Raises:
         InputError: for a file that cannot be read or a line that makes no sense, which
@@ -72,6 +74,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
     rows, columns = np.triu_indices(k)
     information[:, rows, columns] = upper
     information[:, columns, rows] = upper
+    information = nearest_semidefinite(information, path)
     edges = np.searchsorted(file.ids, file.edges.ids)
     try:
         return PoseGraph.from_edges(
