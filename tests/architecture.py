@@ -31,6 +31,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("io.poses", "io.graphs"),
     ("io",),
     ("__init__",),
+    ("testing",),
     ("app.colors", "app.describe", "app.pair_log"),
     ("app.result",),
     ("app.plot",),

@@ -6,8 +6,13 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
+import numpy as np
 import pytest
+from helpers import blob, switched_on
+
+import jaxreg as jr
 
 
 ROOT = Path(__file__).parents[1]
@@ -41,3 +46,44 @@ def test_names_on_the_page_of_equations_exist():
             except ModuleNotFoundError:
                 holder = getattr(importlib.import_module(owner), inner)
             assert hasattr(holder, last), name
+
+
+def test_the_code_of_extending_keeps_its_promises(monkeypatch):
+    text = (ROOT / "docs/pages/extending.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    module = ModuleType("extending")  # of which classes can be pickled
+    monkeypatch.setitem(sys.modules, "extending", module)
+    names = vars(module)
+    with switched_on("jax_disable_most_optimizations"):
+        for block in blocks:
+            exec(compile(block, "extending.md", "exec"), names)
+    # Checked, and of use: every part runs in a method.
+    checks = {name for name in names if name.startswith("check_")}
+    assert checks == {
+        "check_averager",
+        "check_kernel",
+        "check_resampler",
+        "check_residual",
+    }
+    target = blob(200, 3)
+    method = jr.ICP(names["Height"](), names["PseudoHuber"](), max_steps=20)
+    sol = jr.register(target + np.float32(0.02), target, method)
+    np.testing.assert_allclose(sol.T_target_source[:3, 3], -0.02, atol=1e-3)
+
+
+def test_tables_name_every_status_and_contract():
+    text = (ROOT / "docs/pages/words.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([A-Z_]+) \| (\d) \| (.*?) \|", text, re.MULTILINE)
+    table = {name: int(value) for name, value, meaning in rows if meaning}
+    assert table == {status.name: int(status) for status in jr.Status}
+    text = (ROOT / "docs/pages/extending.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(Abstract\w+)` \|[^|]*\| ([^|]*) \|", text, re.MULTILINE)
+    contracts = {name for name in vars(jr) if name.startswith("Abstract")}
+    assert {name for name, _ in rows} == contracts
+    for name, wanted in rows:
+        cls = getattr(jr, name)
+        methods = set(cls.__abstractmethods__)
+        fields = set(cls.__abstractvars__) | set(cls.__abstractclassvars__)
+        kinds = cls.__annotations__.items()
+        fields |= {key for key, kind in kinds if "ClassVar" in str(kind)}
+        assert set(re.findall(r"`(\w+)`", wanted)) == methods | fields, name

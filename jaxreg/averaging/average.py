@@ -49,7 +49,8 @@ def average(
 
     Frame 0 is fixed at `init[0]`, or at the identity. Works under `jit`, `vmap` (over
     graphs with a leading axis on every array) and `grad`. The answer has the dtype of
-    the graph and does not depend on the unit of length.
+    the graph and does not depend on the unit of length, unless `PoseGraphLM` is given
+    no information.
 
         >>> import jaxreg as jr
         >>> east = [[1, 0, 1], [0, 1, 0], [0, 0, 1]]

@@ -1,0 +1,192 @@
+"""The promises of a method of `register`."""
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxreg._core.status import Status
+from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
+from jaxreg.registration import register
+from jaxreg.testing.problems import motion, move, pair, skew
+from jaxreg.testing.promises import (
+    Answer,
+    Change,
+    Problem,
+    changed,
+    promise,
+    promise_dtypes,
+    promise_equal,
+    promise_known_status,
+    promise_no_slopes,
+    promise_rigid,
+    promise_round_trips,
+    promise_same,
+    promise_slopes,
+    promise_traced_numbers,
+    run_side_by_side,
+)
+
+
+# A power of two: only the unit changes, nothing is rounded.
+_UNIT = 1024.0
+_JUNK = 3
+
+
+def check_registrar(
+    method: AbstractRegistrar,
+    *,
+    d: int = 3,
+    gradients: Literal["exact", "zero"] | None = None,
+    draws: bool = False,
+    lengths: bool = False,
+) -> RegistrationSolution:
+    """Registers two noisy samples of a surface from the identity, 0.15 rad away.
+
+    Promised are: the same answer alone, compiled, and side by side with others; dtypes
+    of the data; poses that are rigid; masked rows and rows that are not finite count
+    for nothing; TOO_FEW_POINTS and the identity for fewer than d + 1 points; that the
+    pose follows both clouds when they are moved, and another unit of length; gradients
+    as said.
+
+    Args:
+        method: with a small budget, as compiling is what this costs; for exact
+            gradients converged to about 1e-13.
+        d: dimension of the points, 2 or 3.
+        gradients: "exact" where those of the pose by both clouds are those of central
+            differences, "zero" where they are cut; None promises nothing.
+        draws: whether it draws poses, which do not turn with the clouds; then these
+            are only shifted.
+        lengths: whether settings are lengths in the unit of the input; then the unit
+            stays.
+
+    Returns:
+        The solution of the first problem.
+
+    Raises:
+        AssertionError: naming the promise that is broken.
+    """
+    promise_traced_numbers(method)
+    name, key = type(method).__name__, jax.random.key(0)
+
+    def solve(*arrays: jax.Array) -> tuple[jax.Array, RegistrationSolution]:
+        source, target, init, *masks = arrays
+        solution = register(
+            *(source, target, method, init, key),
+            source_mask=masks[0],
+            target_mask=masks[1],
+        )
+        return solution.T_target_source, solution
+
+    with jax.enable_x64(True):
+        changes = _changes(d) if gradients == "exact" else []
+        problems = _problems(d, draws) | changed(_problem(d), changes)
+        answers = run_side_by_side(solve, problems, gradients is not None)
+        for which in ("plain", "other"):
+            alone = solve(*map(jax.device_put, problems[which]))[1]
+            promise_dtypes(alone, float, name)
+            promise_same(name, RegistrationSolution, answers[which].solution, alone)
+        _promise_statuses(name, answers, d)
+        _promise_equivariance(name, answers, d, draws, lengths)
+        if gradients == "exact":
+            promise_slopes(name, answers, changes)
+        elif gradients == "zero":
+            promise_no_slopes(name, answers)
+        promise_round_trips(method, alone)
+        single = [x.astype(np.float32) if x.dtype != bool else x for x in _problem(d)]
+        with jax.check_tracer_leaks():
+            out = jax.eval_shape(solve, *map(jnp.asarray, single))
+        promise_dtypes(out, np.float32, name)
+    return alone
+
+
+def _problem(d: int, seed: int = 0) -> Problem:
+    """Clouds, a guess and masks, with masked rows behind the points."""
+    clouds = [np.concatenate([x, np.zeros((_JUNK, d))]) for x in pair(d, seed)]
+    mask = np.arange(len(clouds[0])) < len(clouds[0]) - _JUNK
+    return *clouds, np.eye(d + 1), mask, mask
+
+
+def _frames(d: int, draws: bool) -> list[np.ndarray]:
+    """How the source and the target are moved."""
+    moves = [motion(d, 0.7, 1.0, seed) for seed in (1, 2)]
+    for T in moves if draws else []:
+        T[:d, :d] = np.eye(d)
+    return moves
+
+
+def _problems(d: int, draws: bool) -> dict[str, Problem]:
+    source, target, still, source_mask, target_mask = plain = _problem(d)
+
+    def behind(value: float) -> np.ndarray:
+        return np.where(source_mask[:, None], source, value)
+
+    everyone, few = np.ones_like(source_mask), np.arange(len(source)) < d
+    frames = _frames(d, draws)
+    moved = [
+        np.where(source_mask[:, None], move(T, x), 0)
+        for T, x in zip(frames, (source, target), strict=True)
+    ]
+    guess = frames[1] @ np.linalg.inv(frames[0])
+    masks = source_mask, target_mask
+    return {
+        "plain": plain,
+        "other": _problem(d, 1),
+        "junk": (behind(7.0), target, still, *masks),
+        "not finite": (behind(np.nan), target, still, everyone, target_mask),
+        "few": (source, target, still, few, target_mask),
+        "moved": (*moved, guess, *masks),
+        "unit": (_UNIT * source, _UNIT * target, still, *masks),
+    }
+
+
+def _changes(d: int) -> list[Change]:
+    """Each source point its own way; the target as a whole, which keeps its spacing."""
+    rng = np.random.default_rng(1)
+    source, target, _, mask, _ = _problem(d)
+    carried = target @ skew(rng, 1, d)[0] + rng.standard_normal(d)
+    apart = rng.standard_normal(source.shape)
+    rows = mask[:, None]
+    return [(rows * apart, 0 * target), (0 * source, rows * carried)]
+
+
+def _promise_statuses(name: str, answers: dict[str, Answer], d: int) -> None:
+    for which, answer in answers.items():
+        sol = answer.solution
+        promise_rigid(name, which, sol.T_target_source)
+        promise_known_status(name, sol.status)
+        for share in (sol.fitness, sol.overlap):
+            promise(0 <= share <= 1 + 1e-9, f"{name}: a share of {share}.")
+    few = answers["few"].solution
+    promise(
+        few.status == Status.TOO_FEW_POINTS
+        and np.array_equal(few.T_target_source, np.eye(d + 1)),
+        f"{name}: {d} points of dimension {d}: wanted TOO_FEW_POINTS and the identity.",
+    )
+    for which, what in (
+        ("junk", "masked rows change the answer"),
+        ("not finite", "rows that are not finite change the answer"),
+    ):
+        found, wanted = answers[which].solution, answers["plain"].solution
+        promise_equal(found.T_target_source, wanted.T_target_source, f"{name}: {what}")
+        promise(found.status == wanted.status, f"{name}: {what}: its status.")
+
+
+def _promise_equivariance(
+    name: str, answers: dict[str, Answer], d: int, draws: bool, lengths: bool
+) -> None:
+    T = answers["plain"].solution.T_target_source
+    A, B = _frames(d, draws)
+    promise_equal(
+        answers["moved"].solution.T_target_source,
+        B @ T @ np.linalg.inv(A),
+        f"{name}: the pose does not follow the clouds",
+        atol=1e-6,
+    )
+    if not lengths:
+        scaled = answers["unit"].solution.T_target_source.copy()
+        scaled[:d, d] /= _UNIT
+        promise_equal(
+            scaled, T, f"{name}: another unit of length changes the answer", atol=1e-6
+        )

@@ -1,0 +1,232 @@
+"""Each check tells a promise that is broken, in a sentence."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxreg as jr
+from jaxreg import robust
+from jaxreg.averaging.base import solution
+from jaxreg.neighbours import BruteForce
+from jaxreg.robust import three_lower_thirds
+from jaxreg.testing import (
+    check_averager,
+    check_index,
+    check_kernel,
+    check_registrar,
+    check_resampler,
+    check_residual,
+)
+
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
+class Kernel(jr.AbstractKernel):
+    """Least squares, or what `twist` makes of it."""
+
+    twist: str = ""
+    number: jax.Array | float = eqx.field(default=1.0, converter=jnp.asarray)
+
+    def rho(self, sq_residual, width):
+        if self.twist == "starts at one":
+            return 1 + sq_residual / 2
+        if self.twist == "falls":
+            return -sq_residual / 2
+        if self.twist == "not its derivative":
+            return sq_residual
+        return sq_residual / 2
+
+    def weight(self, sq_residual, width):
+        if self.twist == "falls":
+            return -jnp.ones_like(sq_residual)
+        if self.twist == "not finite":
+            return jnp.where(width > 0, 1.0, jnp.nan) * jnp.ones_like(sq_residual)
+        if self.twist == "promotes":
+            return jnp.ones(sq_residual.shape, float)
+        return jnp.ones_like(sq_residual)
+
+    def width_of(self, sq_residual, mask):
+        if self.twist == "squared width":
+            return three_lower_thirds(self, sq_residual, mask) ** 2
+        if self.twist == "masked width":
+            return three_lower_thirds(self, sq_residual, jnp.ones_like(mask))
+        return three_lower_thirds(self, sq_residual, mask)
+
+
+@pytest.mark.parametrize(
+    ("twist", "sentence"),
+    [
+        ("starts at one", r"rho\(0\) is 1"),
+        ("falls", "rho falls"),
+        ("not its derivative", "weight is not the derivative"),
+        ("not finite", "a weight is not finite"),
+        ("promotes", "data of float32 give float64"),
+        ("squared width", "width_of is not a length"),
+        ("masked width", "masked residuals change width_of"),
+    ],
+)
+def test_kernels(twist, sentence):
+    check_kernel(Kernel())
+    with pytest.raises(AssertionError, match=f"Kernel.*{sentence}"):
+        check_kernel(Kernel(twist))
+
+
+def test_a_python_float_would_compile_again():
+    class Fixed(jr.AbstractKernel):
+        number: float = 1.0
+        rho = robust.L2.rho
+        weight = robust.L2.weight
+        width_of = three_lower_thirds
+
+    with pytest.raises(AssertionError, match=r"Fixed\.number is a Python float"):
+        check_kernel(Fixed())
+
+
+class Residual(jr.AbstractResidual):
+    """Point to point, its equations times factors."""
+
+    uses_normals = False
+    H: int = eqx.field(default=1, static=True)
+    b: int = eqx.field(default=1, static=True)
+    descent: int = eqx.field(default=1, static=True)
+    offset: int = eqx.field(default=0, static=True)
+
+    def normal_equations(self, match, weight):
+        H, b = jr.PointToPoint().normal_equations(match, weight)
+        return self.H * H, self.b * b
+
+    def descents(self, match):
+        return self.descent * jr.PointToPoint().descents(match)
+
+    def energy(self, match, weight):
+        return self.offset + jr.PointToPoint().energy(match, weight)
+
+
+@pytest.mark.parametrize(
+    ("factors", "sentence"),
+    [
+        ({"offset": 1}, "the energy is 1 at the identity"),
+        ({"H": 2}, "H is not the second differences"),
+        ({"b": -1, "descent": -1}, "b is not minus the differences"),
+        ({"descent": 2}, "descents do not add up to b"),
+    ],
+)
+def test_residuals(factors, sentence):
+    with pytest.raises(AssertionError, match=f"Residual.*{sentence}"):
+        check_residual(Residual(**factors))
+
+
+class Index(jr.AbstractIndex):
+    """Comparison of all pairs, or what `twist` makes of it."""
+
+    points: jax.Array
+    mask: jax.Array
+    twist: str = eqx.field(default="", static=True)
+
+    @classmethod
+    def build(cls, points, mask=None, twist=""):
+        brute = BruteForce.build(points, mask)
+        mask = jnp.ones_like(brute.mask) if twist == "masked" else brute.mask
+        return cls(points, mask, twist)
+
+    @property
+    def reach(self):
+        return jnp.asarray(jnp.inf, self.points.dtype)
+
+    def lookup(self, columns, num=None, coarse=None):
+        rows = BruteForce(self.points, self.mask).lookup(columns)
+        if self.twist == "another":
+            return jnp.where(jnp.arange(len(rows)) % 7 > 0, rows, jnp.argmax(self.mask))
+        return rows
+
+    def lookup_nearest(self, columns, k):
+        rows = self.lookup(columns)[None]
+        return rows if self.twist == "surplus" else jnp.where(self.mask.any(), rows, -1)
+
+
+@pytest.mark.parametrize(
+    ("twist", "sentence"),
+    [
+        ("masked", "a masked target is found"),
+        ("another", r"0\.\d+ of the answers are the nearest; wanted 1"),
+        ("surplus", "something is found where no target is valid"),
+    ],
+)
+def test_indexes(twist, sentence):
+    def build(points, mask=None):
+        return Index.build(points, mask, twist)
+
+    with pytest.raises(AssertionError, match=f"Index.*{sentence}"):
+        check_index(build)
+
+
+class Resampler(jr.AbstractResampler):
+    """The heaviest particle alone."""
+
+    threshold: jax.Array | float = eqx.field(default=0.5, converter=jnp.asarray)
+
+    def draw(self, key, weight, num):
+        return jnp.full(weight.shape, jnp.argmax(weight), jnp.int32)
+
+
+def test_resamplers():
+    with pytest.raises(AssertionError, match="copies are not as many as their share"):
+        check_resampler(Resampler())
+
+
+class Nothing(jr.AbstractRegistrar):
+    """Leaves the guess, or what `twist` makes of it."""
+
+    twist: str = ""
+
+    def in_frames(self, frames):
+        return self
+
+    def prepare(self, points, mask):
+        return jr.ICP().prepare(points, mask)
+
+    def solve(self, source, target, init, key):
+        found = jr.ICP(jr.PointToPoint(), max_steps=1).solve(source, target, init)
+        T = {
+            "stretched": 2 * init,
+            "fixed": jnp.eye(len(init), dtype=init.dtype),
+        }.get(self.twist, init)
+        return eqx.tree_at(lambda s: s.T_target_source, found, T)
+
+
+@pytest.mark.parametrize(
+    ("twist", "sentence"),
+    [
+        ("stretched", "a pose of the problem 'plain' is not rigid"),
+        ("fixed", "the pose does not follow the clouds"),
+    ],
+)
+def test_registrars(twist, sentence):
+    with pytest.raises(AssertionError, match=f"Nothing.*{sentence}"):
+        check_registrar(Nothing(twist), d=2)
+
+
+class Still(jr.AbstractAverager):
+    """All poses at the identity."""
+
+    trust: int = eqx.field(default=1, static=True)
+
+    def solve(self, graph, init, key):
+        eye = jnp.eye(graph.dim + 1, dtype=graph.T_i_j.dtype)
+        trust = jnp.full_like(graph.weight, self.trust)
+        T = jnp.tile(eye, (graph.num_poses, 1, 1))
+        return solution(graph, T, edge_weight=trust)
+
+
+@pytest.mark.parametrize(
+    ("trust", "sentence"),
+    [
+        (1, "exact motions do not give the true poses"),
+        (2, r"an edge_weight is not in \[0, 1\]"),
+    ],
+)
+def test_averagers(trust, sentence):
+    with pytest.raises(AssertionError, match=f"Still.*{sentence}"):
+        check_averager(Still(trust), d=2)
