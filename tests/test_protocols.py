@@ -94,7 +94,8 @@ def test_methods_of_average(name):
 @pytest.mark.parametrize("index", INDEXES)
 def test_indexes(index):
     row = INDEXES[index]
-    check_index(row.make(3), **row.promises)
+    with jax.debug_nans(False):  # queries that are not finite are asked on purpose
+        check_index(row.make(3), **row.promises)
 
 
 @pytest.mark.parametrize("residual", RESIDUALS, ids=lambda r: type(r).__name__)

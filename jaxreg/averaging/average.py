@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import overload
 
 from jaxreg._core.checks import check_count, check_instance, check_key
-from jaxreg._core.typing import Key, Progress
+from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
 from jaxreg.averaging.many import average_list, check_graph, check_init
@@ -16,7 +16,7 @@ from jaxreg.graph.pose_graph import PoseGraph
 def average(
     graph: PoseGraph,
     method: AbstractAverager | None = None,
-    init: object = None,
+    init: ArrayLike | None = None,
     key: Key | None = None,
     *,
     batch_size: int = 1,
@@ -28,7 +28,7 @@ def average(
 def average(
     graph: Sequence[PoseGraph],
     method: AbstractAverager | None = None,
-    init: object = None,
+    init: ArrayLike | None = None,
     key: Key | None = None,
     *,
     batch_size: int = 1,
@@ -39,7 +39,7 @@ def average(
 def average(
     graph: PoseGraph | Sequence[PoseGraph],
     method: AbstractAverager | None = None,
-    init: object = None,
+    init: ArrayLike | None = None,
     key: Key | None = None,
     *,
     batch_size: int = 1,

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import as_float_array, check_mask, is_concrete
+from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.graph.edge_checks import (
     check_extra,
@@ -57,12 +58,12 @@ class PoseGraph(eqx.Module):
     @classmethod
     def from_edges(
         cls,
-        edges: object,
-        T_i_j: object,
+        edges: ArrayLike,
+        T_i_j: ArrayLike,
         num_poses: int | None = None,
-        weight: object = None,
-        information: object = None,
-        mask: object = None,
+        weight: ArrayLike | None = None,
+        information: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
     ) -> "PoseGraph":
         """Checks relative motions and makes a graph of them.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.checks import check_instance, check_key, is_concrete
-from jaxreg._core.typing import Key, Progress
+from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
 from jaxreg.multiview.choose_pairs import Order, all_pairs, first_pairs
@@ -27,13 +27,13 @@ from jaxreg.registrar import AbstractRegistrar
 
 
 def reconstruct(
-    scans: object,
+    scans: ArrayLike,
     *,
     key: Key,
     method: AbstractRegistrar | None = None,
     averaging: AbstractAverager | None = None,
-    mask: object = None,
-    viewpoints: object = None,
+    mask: ArrayLike | None = None,
+    viewpoints: ArrayLike | None = None,
     order: Order | str = "any",
     previous: object = None,
     hold_previous: bool = False,

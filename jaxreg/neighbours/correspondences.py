@@ -5,19 +5,20 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxreg._core.checks import as_float_array, check_motion, check_pair
+from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.neighbours.auto import exact_index
 from jaxreg.neighbours.base import Neighbours
 
 
 def correspondences(
-    source: object,
-    target: object,
-    T_target_source: object,
+    source: ArrayLike,
+    target: ArrayLike,
+    T_target_source: ArrayLike,
     *,
     max_distance: float | Array | None = None,
-    source_mask: object = None,
-    target_mask: object = None,
+    source_mask: ArrayLike | None = None,
+    target_mask: ArrayLike | None = None,
 ) -> Neighbours:
     """The closest target point of every source point under a pose, exactly.
 

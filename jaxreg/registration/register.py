@@ -17,7 +17,7 @@ from jaxreg._core.checks import (
     check_pair,
     is_concrete,
 )
-from jaxreg._core.typing import Key, Progress
+from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.batching.padding import (
     check_lists,
     is_list_of_clouds,
@@ -36,11 +36,11 @@ def register(  # pyright: ignore[reportOverlappingOverload]
     source: Sequence[Array | np.ndarray],
     target: Sequence[Array | np.ndarray],
     method: AbstractRegistrar | None = None,
-    init: object = None,
+    init: ArrayLike | None = None,
     key: Key | None = None,
     *,
-    source_mask: object = None,
-    target_mask: object = None,
+    source_mask: ArrayLike | None = None,
+    target_mask: ArrayLike | None = None,
     batch_size: int = 1,
     progress: Progress | None = None,
 ) -> list[RegistrationSolution]: ...
@@ -48,28 +48,28 @@ def register(  # pyright: ignore[reportOverlappingOverload]
 
 @overload
 def register(
-    source: object,
-    target: object,
+    source: ArrayLike,
+    target: ArrayLike,
     method: AbstractRegistrar | None = None,
-    init: object = None,
+    init: ArrayLike | None = None,
     key: Key | None = None,
     *,
-    source_mask: object = None,
-    target_mask: object = None,
+    source_mask: ArrayLike | None = None,
+    target_mask: ArrayLike | None = None,
     batch_size: int = 1,
     progress: Progress | None = None,
 ) -> RegistrationSolution: ...
 
 
 def register(
-    source: object,
-    target: object,
+    source: ArrayLike,
+    target: ArrayLike,
     method: AbstractRegistrar | None = None,
-    init: object = None,
+    init: ArrayLike | None = None,
     key: Key | None = None,
     *,
-    source_mask: object = None,
-    target_mask: object = None,
+    source_mask: ArrayLike | None = None,
+    target_mask: ArrayLike | None = None,
     batch_size: int = 1,
     progress: Progress | None = None,
 ) -> RegistrationSolution | list[RegistrationSolution]:

@@ -82,13 +82,14 @@ def promise_same(name: str, kind: type, found: Any, alone: Any) -> None:
         f"{name}: wanted a solution of type {kind.__name__}, found "
         f"{type(alone).__name__}.",
     )
-    sides = []
-    for one in (found, alone):
-        fields = dict(vars(one))
-        fields.pop("num_steps", None)
+
+    def compared(one: Any) -> dict[str, Any]:
+        fields = {k: v for k, v in vars(one).items() if k != "num_steps"}
         first = jax.tree.map(lambda x: x[:1] if np.ndim(x) else 0 * x, fields["trace"])
-        sides.append({**fields, "trace": first})
-    promise_equal(*sides, f"{name}: alone and side by side do not give the same")
+        return {**fields, "trace": first}
+
+    what = f"{name}: alone and side by side do not give the same"
+    promise_equal(compared(found), compared(alone), what)
 
 
 def promise_round_trips(method: eqx.Module, solution: Any) -> None:

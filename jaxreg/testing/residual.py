@@ -86,13 +86,13 @@ def _matched(
 ) -> Match:
     """Point i of the source with point i of the target; normals are of both."""
     dtype, everyone = source.dtype, jnp.ones(len(source), bool)
-    clouds = [
+    here, there = (
         PointCloud(jnp.asarray(x), jnp.asarray(n.astype(dtype)), everyone)
         for x, n in zip((source, target), normals, strict=True)
-    ]
-    index = BruteForce.build(clouds[1].points, everyone)
+    )
+    problem = Problem.of(here, there, BruteForce.build(there.points, everyone))
     rows = jnp.arange(len(source), dtype=jnp.int32)
-    return match(Problem.of(*clouds, index), jnp.asarray(T.astype(dtype)), rows)
+    return match(problem, jnp.asarray(T.astype(dtype)), rows)
 
 
 def _normals(d: int, seed: int = 0) -> np.ndarray:
@@ -113,9 +113,9 @@ def _noisy(
     source = surface(NUM_POINTS, d)
     noise = 0.1 * np.random.default_rng(3).standard_normal(source.shape)
     target = move(motion(d, 0.2, 0.1, 1), source) + noise
-    clouds = [move(G, x).astype(dtype) for x in (source, target)]
+    source, target = (move(G, x).astype(dtype) for x in (source, target))
     T = G @ T @ np.linalg.inv(G)
-    return _matched(*clouds, _normals(d) @ G[:d, :d].T, T), T
+    return _matched(source, target, _normals(d) @ G[:d, :d].T, T), T
 
 
 def _promise_zero(name: str, residual: AbstractResidual, d: int) -> None:

@@ -184,20 +184,3 @@ def test_the_symmetric_residual_vanishes_for_two_points_of_one_circle():
     )
     assert float(_energy(Symmetric(), found, weight)) < 1e-10
     assert float(_energy(PointToPlane(0.0), found, weight)) > 1e-2
-
-
-@in_2d_and_3d
-def test_dtype_is_that_of_the_points(d):
-    with jax.enable_x64(True):
-        problem, T, weight = noisy_problem(d, np.float32)
-
-        def everything(T):
-            found = match(problem, T)
-            here = moved(found, T, T)
-            return [
-                (r.normal_equations(found, weight), r.energy(here, weight))
-                for r in RESIDUALS
-            ]
-
-        out = jax.tree.leaves(jax.eval_shape(everything, T))
-        assert all(x.dtype == jnp.float32 for x in out)

@@ -189,10 +189,9 @@ class Nothing(jr.AbstractRegistrar):
 
     def solve(self, source, target, init, key):
         found = jr.ICP(jr.PointToPoint(), max_steps=1).solve(source, target, init)
-        T = {
-            "stretched": 2 * init,
-            "fixed": jnp.eye(len(init), dtype=init.dtype),
-        }.get(self.twist, init)
+        assert init is not None
+        eye = jnp.eye(len(init), dtype=init.dtype)
+        T = {"stretched": 2 * init, "fixed": eye}[self.twist]
         return eqx.tree_at(lambda s: s.T_target_source, found, T)
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.graph.edge_checks import EdgeError
 from jaxreg.graph.pose_graph import PoseGraph
@@ -113,8 +114,8 @@ def read_g2o_poses(
 def write_g2o(
     path: str | Path,
     graph: PoseGraph,
-    T_world_i: object = None,
-    ids: object = None,
+    T_world_i: ArrayLike | None = None,
+    ids: ArrayLike | None = None,
 ) -> None:
     """Writes poses and edges; the file appears whole or not at all.
 

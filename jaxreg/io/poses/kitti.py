@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxreg._core.typing import ArrayLike
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 from jaxreg.io.rows import numbers, read_lines
@@ -34,7 +35,7 @@ def read_kitti(path: str | Path) -> Float[Array, "v 4 4"]:
     return jnp.asarray(np.stack(poses), dtype=jnp.result_type(float))
 
 
-def write_kitti(path: str | Path, T_world_i: object) -> None:
+def write_kitti(path: str | Path, T_world_i: ArrayLike) -> None:
     """Writes poses; the file appears whole or not at all.
 
     Args:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxreg._core.typing import ArrayLike
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 from jaxreg.io.files import text_lines
@@ -14,8 +15,8 @@ from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
 
 def write_tum(
     path: str | Path,
-    T_world_i: object,
-    timestamps: object = None,
+    T_world_i: ArrayLike,
+    timestamps: ArrayLike | None = None,
 ) -> None:
     """Writes poses as a trajectory; the file appears whole or not at all.
 
