@@ -8,14 +8,27 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import blob, switched_on
 
 import jaxreg as jr
+from jaxreg.correlation import ascent
+from jaxreg.local import curvature
+from jaxreg.multiview import place, prepare
+from jaxreg.particle import conclude
 
 
 ROOT = Path(__file__).parents[1]
+#: What the table of statuses says of thresholds.
+THRESHOLDS = {
+    jr.Status.DEGENERATE: (curvature._DEGENERATE, ascent._FREE),
+    jr.Status.LOW_OVERLAP: (float(jnp.asarray(jr.ParticleFilter().min_overlap)),),
+    jr.Status.AMBIGUOUS: (conclude.RIVAL_OVERLAP, conclude._RIVAL_WEIGHT),
+    jr.Status.DISCONNECTED: (place._MIN_TRUST,),
+    jr.Status.UNIT_DIFFERS: (prepare._OTHER_UNIT,),
+}
 
 
 def test_the_site_builds_without_warnings(tmp_path: Path):
@@ -76,6 +89,10 @@ def test_tables_name_every_status_and_contract():
     rows = re.findall(r"^\| ([A-Z_]+) \| (\d) \| (.*?) \|", text, re.MULTILINE)
     table = {name: int(value) for name, value, meaning in rows if meaning}
     assert table == {status.name: int(status) for status in jr.Status}
+    for status, thresholds in THRESHOLDS.items():
+        row = next(x for x in text.splitlines() if x.startswith(f"| {status.name} |"))
+        for value in thresholds:
+            assert re.search(rf"(?<![\d.]){value:g}(?![\d.]*\d)", row), (status, value)
     text = (ROOT / "docs/pages/extending.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(Abstract\w+)` \|[^|]*\| ([^|]*) \|", text, re.MULTILINE)
     contracts = {name for name in vars(jr) if name.startswith("Abstract")}

@@ -53,8 +53,8 @@ class KernelCorrelation(AbstractRegistrar):
             radii of the target, at least two sample spacings of the coarser cloud.
         max_steps: passes over all pairs at most.
         max_points: both clouds are thinned to about this many points.
-        tolerance: the loop stops when a step turns by less than this many radians and
-            shifts by less than this share of the target's radius.
+        tolerance: stop when a step turns by at most so many radians and shifts by at
+            most so many radii (the target's root mean square radius).
 
     In the solution `error` is the energy of those links, the sum over all pairs of
     bandwidth^2 (1 - exp(...)), H its exact Hessian and b its descent direction.

@@ -77,8 +77,9 @@ class ICP(AbstractRegistrar):
         max_correspondence_distance: farther pairs do not count, in the unit of the
             input; infinite by default, as the kernel bounds what far pairs do.
         width_end: final kernel width in sample spacings.
-        tolerance: the loop stops when a step turns by less than this many radians and
-            shifts by less than this share of the target's radius, at the final width.
+        tolerance: stop when a step turns by at most so many radians and shifts by at
+            most so many radii (the target's root mean square radius), at the
+            final width.
         with_scale: whether the source may also grow or shrink: then the block of
             `T_target_source` is a rotation times that factor, without a guess it
             starts from the ratio of the clouds' radii, and H, b and the covariance

@@ -31,7 +31,7 @@ def finish(
     """Averages, refines, and returns to the frames and unit of the input.
 
     Args:
-        method: tells which pairs are believed.
+        method: tells which pairs are trusted.
         averaging: see `place`.
         scans: prepared scans.
         motions: of pairs, in the scans' centred frames; some may be padding.

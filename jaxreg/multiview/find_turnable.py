@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxreg.graph.trees import components
-from jaxreg.multiview.place import Placement, believed, in_main_body
+from jaxreg.multiview.place import Placement, in_main_body, joins
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.particle.conclude import RIVAL_OVERLAP
 
@@ -24,7 +24,7 @@ def turnable(motions: RelativeMotions, placement: Placement) -> Bool[Array, " v"
     """
     best = motions.overlap[:, :1]
     rival = jnp.any(motions.overlap[:, 1:] > RIVAL_OVERLAP * best, axis=1)
-    settled = believed(placement.edge_weight) & ~rival
+    settled = joins(placement.edge_weight) & ~rival
     part = placement.part
     body = components(motions.pairs, settled.astype(best.dtype), part.shape[0])
     return ~in_main_body(body, part)

@@ -1,7 +1,7 @@
 """Pairs of a sequence: the motion goes on as before, or else it is searched for.
 
 A scanner that moves on moves much as it did a scan ago, so a descent from that motion
-finds most pairs of a sequence in a fraction of a search. What it finds is believed at
+finds most pairs of a sequence in a fraction of a search. What it finds is trusted at
 once only if it overlaps by so much as no chance does; else it competes with the search.
 """
 

@@ -18,7 +18,7 @@ from jaxreg.robust import GemanMcClure
 
 # Modes of a pair that are kept; most pairs have no second one.
 _MOST_MODES = 4
-# Of methods that do not say: the least overlap that is believed, and the kernel width
+# Of methods that do not say: the least overlap that is trusted, and the kernel width
 # of the first step, in radii, those of `ParticleFilter()`.
 _MIN_OVERLAP, _WIDEST = 0.1, 0.3
 
@@ -31,7 +31,7 @@ def num_kept(method: AbstractRegistrar) -> int:
 
 
 def min_overlap(method: AbstractRegistrar) -> Array | float:
-    """The least overlap of a pose that is believed."""
+    """The least overlap of a pair that is trusted."""
     if isinstance(method, AbstractIndexedRegistrar):
         return method.min_overlap
     return _MIN_OVERLAP

@@ -130,9 +130,9 @@ def _averaged(
     graph = PoseGraph(swap[pairs], T_i_j, trusted, trusted > 0, None, num_scans)
     solution = average(_with_hung(graph, hung[swap], min_overlap), averaging)
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
-    agreed = jnp.where(believed(edge_weight), trusted, 0)
+    agreed = jnp.where(joins(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
-    # Nothing could confirm the only pair of two scans: it is believed as `register` is.
+    # Nothing could confirm the only pair of two scans: it is trusted as `register` is.
     strong = (_STRONG if num_scans > 2 else 1) * min_overlap
     part = _confirmed_components(pairs, agreed, num_scans, strong)
     T_world_i, status, trace = solution.T_world_i[swap], solution.status, solution.trace
@@ -187,7 +187,7 @@ def _with_hung(graph: PoseGraph, hung: Bool[Array, " v"], weight: Scalar) -> Pos
     )
 
 
-def believed(edge_weight: Float[Array, " e"]) -> Bool[Array, " e"]:
+def joins(edge_weight: Float[Array, " e"]) -> Bool[Array, " e"]:
     """Which pairs join scans, by the trust that averaging leaves them."""
     return edge_weight > _MIN_TRUST
 

@@ -17,7 +17,7 @@ from jaxreg.matching import Problem, score
 from jaxreg.multiview.choose_pairs import Order, first_pairs, most_pairs, next_pairs
 from jaxreg.multiview.follow_sequence import SURE, descended_in_input_frames
 from jaxreg.multiview.method import min_overlap, num_kept
-from jaxreg.multiview.place import Placement, believed, place
+from jaxreg.multiview.place import Placement, joins, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
 from jaxreg.registrar import AbstractRegistrar
@@ -164,7 +164,7 @@ class Rounds:
         placement, likely = _prospects(self.method, self.averaging, self.scans, motions)
         trusted = np.zeros_like(self.tried)
         i, j = np.asarray(motions.pairs).T
-        trusted[i, j] = np.asarray(believed(placement.edge_weight)) & (i != j)
+        trusted[i, j] = np.asarray(joins(placement.edge_weight)) & (i != j)
         likely = np.asarray(likely)
         return trusted | trusted.T, likely + likely.T, np.asarray(placement.part)
 

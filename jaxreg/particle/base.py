@@ -45,7 +45,7 @@ from jaxreg.robust import AbstractKernel
 
 # Source points that only the scores look up by comparing all pairs.
 _FEW = 600
-# The agreement of normals decides what is believed: the careful estimate.
+# The agreement of normals decides what is trusted: the careful estimate.
 _NORMAL_NEIGHBOURS = 10
 
 

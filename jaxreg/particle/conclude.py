@@ -101,7 +101,7 @@ def conclude(
         refine_steps: steps on all points; the modes are then ordered by the overlap
             that they reach. Without, by energy: the answer is the particle of least
             energy.
-        min_overlap: least overlap of a pose that is believed.
+        min_overlap: below this overlap the status is LOW_OVERLAP.
     """
     dtype = particles.energy.dtype
     limit = jnp.asarray(_APART, dtype)

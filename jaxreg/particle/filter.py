@@ -78,9 +78,10 @@ class ParticleFilter(AbstractFilter):
         prior_error_share: how much of the motion error of t = 0 the dynamics see. It
             spans a descent from nowhere in particular.
         width_start, width_end: kernel width at t = 0 and at t = num_times.
-        tolerance: the filter stops when no particle's motion error exceeds this many
-            radians and radii: then the diffusion has died.
-        min_overlap: least overlap of a pose that is believed.
+        tolerance: stop when no motion error turns by more than so many radians or
+            shifts by more than so many radii (the target's root mean square radius):
+            then the diffusion has died.
+        min_overlap: below this overlap the status is LOW_OVERLAP.
 
     Raises: ValueError while constructing, for counts that leave nothing to do.
 

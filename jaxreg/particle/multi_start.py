@@ -35,9 +35,10 @@ class MultiStart(AbstractSearch):
         prior, energy, residual, kernel, step, index: as there. The energy ranks the
             ends, of which a mode's weight is its share.
         width_start, width_end: kernel width at the first and at the last step.
-        tolerance: descents have come to rest where the last step moves none by more
-            than this many radians and radii.
-        min_overlap: least overlap of a pose that is believed.
+        tolerance: converged where the last step turns none by more than so many radians
+            and shifts none by more than so many radii (the target's root mean square
+            radius).
+        min_overlap: below this overlap the status is LOW_OVERLAP.
 
     Raises: ValueError while constructing, for counts that leave nothing to do.
 

@@ -20,7 +20,7 @@ class AbstractIndexedRegistrar(AbstractRegistrar):
 
     Attributes:
         num_modes: rows of the `modes` of a solution.
-        min_overlap: least overlap of a pose that is believed.
+        min_overlap: below this overlap the status is LOW_OVERLAP.
     """
 
     num_modes: eqx.AbstractVar[int]

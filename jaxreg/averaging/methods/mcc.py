@@ -50,7 +50,8 @@ class MCC(AbstractAverager):
         rows: `RootRows()`, as half-quadratic theory asks, or `WeightRows()`, as printed
             in Eq. 17.
         max_steps: largest number of steps (static).
-        tolerance: stop below this change, radians and share of the size of the scene.
+        tolerance: stop when a step turns by at most so many radians and shifts by at
+            most so many scene sizes (length scale of the graph plus spread of poses).
         initialiser: finds the start when `init` is None.
 
     Lengths are measured in the graph's own length scale, so another unit does not

@@ -36,7 +36,8 @@ class MotionAveraging(AbstractAverager):
 
     Attributes:
         max_steps: largest number of steps (static).
-        tolerance: stop below this change, radians and share of the size of the scene.
+        tolerance: stop when a step turns by at most so many radians and shifts by at
+            most so many scene sizes (length scale of the graph plus spread of poses).
         initialiser: finds the start when `init` is None.
 
     Gradients: implicit at the fixed point with respect to `T_i_j`.
@@ -72,7 +73,8 @@ class WeightedMotionAveraging(AbstractAverager):
         rows: `RootRows()` to minimise the sum of weight * |residual|^2, `WeightRows()`
             to scale the rows by the weight itself, as the MCC paper does (Eq. 17).
         max_steps: largest number of steps (static).
-        tolerance: stop below this change, radians and share of the size of the scene.
+        tolerance: stop when a step turns by at most so many radians and shifts by at
+            most so many scene sizes (length scale of the graph plus spread of poses).
         initialiser: finds the start when `init` is None.
 
     Gradients: implicit at the fixed point with respect to `T_i_j` and `weight`.
