@@ -9,13 +9,15 @@ is `PointToPoint` with `Huber` and `LevenbergMarquardt`.
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from jaxreg._core.adjoint import AbstractAdjoint, ImplicitAdjoint
 from jaxreg._core.arrays import cast_floats, spread_rows, traced
 from jaxreg._core.checks import (
+    as_float_array,
     check_counts,
     check_not_negative,
+    check_pair,
     check_parts,
     check_positive,
 )
@@ -25,7 +27,6 @@ from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import (
     PointCloud,
     median_spacing,
-    rms_radius,
     thin,
     without_noise,
 )
@@ -34,6 +35,7 @@ from jaxreg.local.curvature import Curvature, is_degenerate
 from jaxreg.local.descent import Descending, Descent, Limits
 from jaxreg.local.implicit import stationary
 from jaxreg.local.optimiser import LocalOptimiser
+from jaxreg.local.scale import first_guess
 from jaxreg.local.steps import AbstractStep, GaussNewton
 from jaxreg.matching.problem import Match, Problem, match
 from jaxreg.matching.residuals import AbstractResidual, PlaneToPlane
@@ -50,6 +52,7 @@ from jaxreg.registrar import (
     Frames,
     Modes,
     RegistrationSolution,
+    prepare_pair,
 )
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
@@ -139,6 +142,30 @@ class ICP(AbstractRegistrar):
         """Without noise that fills the box, thinned, in spatial order, with normals."""
         return thin(points, without_noise(points, mask), self.max_points)
 
+    @eqx.filter_jit
+    def iteration(
+        self, source: object, target: object, init: object = None
+    ) -> tuple[Descending, Descent]:
+        """The steps on one pair, to be taken by hand, and the state before the first.
+
+            descending, state = ICP().iteration(source, target)
+            while not descending.terminate(state):
+                state = descending.step(state)
+            T_target_source = descending.problem.frames.leave(state.T)
+
+        Args:
+            source: `(n, d)` points.
+            target: `(m, d)` points.
+            init: the initial guess, by default the identity of centred clouds.
+        """
+        pair = check_pair(source, target, None, None)
+        ready = prepare_pair(self, pair)
+        method = cast_floats(self.in_frames(ready.frames), pair[0].dtype)
+        descending, _ = method._descending(ready.source, ready.target, ready.frames)
+        T = None if init is None else ready.frames.enter(as_float_array(init, "init"))
+        start = first_guess(ready.source, ready.target, T, self.with_scale)
+        return descending, descending.init(start)
+
     def solve(
         self,
         source: PointCloud,
@@ -149,12 +176,10 @@ class ICP(AbstractRegistrar):
         """Descends from `init` in the prepared frames."""
         dtype = source.points.dtype
         self = cast_floats(self, dtype)
-        init, start_scale = self._start(source, target, init)
-        spacing = median_spacing(target.points, target.mask)
-        problem = Problem.of(source, target, self._indexed(target, spacing))
-        limits = self._limits(spacing)
-        optimiser = self._optimiser
-        descending = Descending(optimiser, problem, limits)
+        init, start_scale = first_guess(source, target, init, self.with_scale)
+        descending, spacing = self._descending(source, target)
+        optimiser, problem = descending.optimiser, descending.problem
+        limits = descending.limits
         descending, (init, start_scale) = self.adjoint.inputs(
             (descending, (init, start_scale))
         )
@@ -209,9 +234,15 @@ class ICP(AbstractRegistrar):
             modes=modes,
         )
 
-    @property
-    def _optimiser(self) -> LocalOptimiser:
-        return LocalOptimiser(self.residual, self.kernel, self.step)
+    def _descending(
+        self, source: PointCloud, target: PointCloud, frames: Frames | None = None
+    ) -> tuple[Descending, Scalar]:
+        """The steps, and the target's sample spacing."""
+        spacing = median_spacing(target.points, target.mask)
+        index = self._indexed(target, spacing)
+        problem = Problem.of(source, target, index, frames)
+        optimiser = LocalOptimiser(self.residual, self.kernel, self.step)
+        return Descending(optimiser, problem, self._limits(spacing)), spacing
 
     def _limits(self, spacing: Scalar) -> Limits:
         return Limits(
@@ -226,25 +257,6 @@ class ICP(AbstractRegistrar):
         if self.index is None:
             return index_within(cloud.points, cloud.mask, spacing)
         return self.index.build(cloud.points, cloud.mask)
-
-    def _start(
-        self, source: PointCloud, target: PointCloud, init: Motion | None
-    ) -> tuple[Motion, Float[Array, ""]]:
-        """The rigid guess and the scale before it."""
-        d, dtype = source.points.shape[1], source.points.dtype
-        one = jnp.ones((), dtype)
-        if init is None:
-            if self.with_scale:
-                radius = rms_radius(source.points, source.mask)
-                ratio = rms_radius(target.points, target.mask) / radius
-                one = jnp.where(radius > 0, ratio, one)
-            return lie.identity(d, dtype), one
-        if not self.with_scale:
-            return init, one
-        block = lie.rotation(init)
-        scale = jnp.sqrt(jnp.sum(block * block) / d)
-        scale = jnp.where(scale > 0, scale, one)
-        return lie.compose(block / scale, lie.translation(init)), scale
 
     def _worse_than(
         self, end: Descent, problem: Problem, found: Match, limits: Limits

@@ -11,6 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core.typing import Motion, Scalar
+from jaxreg.cloud import PointCloud, rms_radius
+from jaxreg.geometry import lie
 from jaxreg.linear.small import solve_semidefinite
 from jaxreg.matching.problem import Match
 from jaxreg.matching.residuals import AbstractResidual
@@ -55,3 +58,23 @@ def fit_scale(
         (growth * found.rotated, found.residual - (growth - 1) * found.rotated),
     )
     return growth, after
+
+
+def first_guess(
+    source: PointCloud, target: PointCloud, init: Motion | None, with_scale: bool
+) -> tuple[Motion, Scalar]:
+    """A rigid guess and the scale before it; without one the ratio of the radii."""
+    d, dtype = source.points.shape[1], source.points.dtype
+    one = jnp.ones((), dtype)
+    if init is None:
+        if with_scale:
+            radius = rms_radius(source.points, source.mask)
+            ratio = rms_radius(target.points, target.mask) / radius
+            one = jnp.where(radius > 0, ratio, one)
+        return lie.identity(d, dtype), one
+    if not with_scale:
+        return init, one
+    block = lie.rotation(init)
+    scale = jnp.sqrt(jnp.sum(block * block) / d)
+    scale = jnp.where(scale > 0, scale, one)
+    return lie.compose(block / scale, lie.translation(init)), scale

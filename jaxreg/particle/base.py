@@ -122,8 +122,6 @@ class AbstractSearch(AbstractIndexedRegistrar):
 
     def problem(self, pair: tuple[Array, ...], key: Key) -> Problem:
         """What `search` works on, of a source, a target and their masks; traced."""
-        if pair[0].ndim != 2:
-            raise ValueError(f"source: wanted shape (n, d), found {pair[0].shape}.")
         ready = prepare_pair(self, lax.stop_gradient(pair))
         index = self._indexes(ready.source, ready.target)[1]
         problem = Problem.of(ready.source, ready.target, index, ready.frames)

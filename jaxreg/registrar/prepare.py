@@ -33,6 +33,8 @@ class PreparedPair(eqx.Module):
 def prepare_pair(method: AbstractRegistrar, pair: tuple[Array, ...]) -> PreparedPair:
     """Of a source, a target and their masks; traced."""
     source, target, *masks = pair
+    if source.ndim != 2:
+        raise ValueError(f"source: wanted shape (n, d), found {source.shape}.")
     sides = on_both(Side.of, *_levelled((source, masks[0]), (target, masks[1])))
     frames = Frames(sides[0].mean, sides[1].mean, sides[1].radius)
     method = method.in_frames(frames)
