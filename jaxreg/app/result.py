@@ -4,12 +4,11 @@ A `Result` is what a reconstruction or registration found, on the host and in fl
 in the frames and unit of the files that were read.
 """
 
-import contextlib
 import json
 import math
 import platform
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -22,7 +21,7 @@ import numpy as np
 from jaxreg._core.status import Status
 from jaxreg.app.colors import scan_colors
 from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.io.atomic import atomic_folder, atomic_write
+from jaxreg.io.atomic import atomic_write
 from jaxreg.io.graphs.g2o import write_g2o
 from jaxreg.io.points.ply import write_ply
 from jaxreg.io.poses.tum import write_tum
@@ -133,29 +132,6 @@ def result_document(
         "files": result.files,
     }
     return document if errors is None else {**document, "errors": errors}
-
-
-@contextlib.contextmanager
-def result_folder(folder: str | Path) -> Iterator[Path]:
-    """`atomic_folder`, without what an earlier result there has and this one lacks.
-
-    A folder then never mixes two results: `merged_2.ply` goes if the new result has one
-    component. Only files that the earlier result.json names are removed.
-
-    Raises:
-        InputError: if the folder cannot be written.
-    """
-    with atomic_folder(folder, replaces=_files_of_earlier(Path(folder))) as staging:
-        yield staging
-
-
-def _files_of_earlier(folder: Path) -> set[str]:
-    try:
-        document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        names = document.get("files", [])
-        return {n for n in names if n == Path(n).name and n not in ("", ".", "..")}
-    except (OSError, ValueError, AttributeError, TypeError):
-        return set()  # none there, or another program's
 
 
 def write_json(path: str | Path, document: dict[str, Any]) -> None:

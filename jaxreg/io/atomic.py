@@ -4,13 +4,20 @@ By hand: packages for single files are no longer kept up, and none does folders.
 """
 
 import contextlib
+import json
 import os
+import shutil
 import tempfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
 
 from jaxreg.io.errors import InputError
+
+
+# Folders of results that are being written, and of those that are whole; a file of the
+# latter names what an older result has and they have not.
+_STAGING, _READY, _OLD = ".jaxreg-part-", ".jaxreg-whole-", ".old"
 
 
 @contextlib.contextmanager
@@ -63,30 +70,64 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
 def atomic_folder(folder: str | Path, replaces: Collection[str] = ()) -> Iterator[Path]:
     """Yields a staging folder whose files move into `folder` when the block succeeds.
 
-    If the block raises, none of them appears: `folder` never holds half a result.
+    If the block raises, none of them appears: `folder` never holds half a result. A
+    process that is killed while they move leaves them for `complete_folder`.
 
     Args:
         folder: made if needed, parents included; files of other names in it stay.
         replaces: names of files in it that go, too, when the block succeeds.
 
     Raises:
-        InputError: if the folder cannot be written.
+        InputError: if the folder cannot be written, or a folder in it has the name of
+            a file that is to appear.
     """
     folder = Path(folder)
     require_writable(folder)
     made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
+    staging = Path(tempfile.mkdtemp(prefix=_STAGING, dir=folder))
     try:
-        with tempfile.TemporaryDirectory(prefix=".jaxreg-", dir=folder) as staging:
-            yield Path(staging)
-            for name in replaces:
-                (folder / name).unlink(missing_ok=True)
-            for file in sorted(Path(staging).iterdir()):
-                os.replace(file, folder / file.name)
+        yield staging
+        names = sorted(file.name for file in staging.iterdir())
+        for name in names:
+            if (folder / name).is_dir():
+                raise InputError(
+                    f"{folder / name}: a folder is where a result is to be written.\n"
+                    "Rename it, or choose another folder for the results (--out)."
+                )
+        old = sorted(set(replaces) - set(names))
+        (staging / _OLD).write_text(json.dumps(old), encoding="utf-8")
+        ready = folder / staging.name.replace(_STAGING, _READY, 1)
+        os.replace(staging, ready)
     except BaseException:
+        shutil.rmtree(staging, ignore_errors=True)
         if made:
-            folder.rmdir()
+            with contextlib.suppress(OSError):
+                folder.rmdir()
         raise
+    _move(ready)
+
+
+def complete_folder(folder: str | Path) -> None:
+    """Ends what killed processes began in a folder that no living one writes to.
+
+    A result that was whole moves to its place, half ones go.
+    """
+    for ready in Path(folder).glob(f"{_READY}*"):
+        _move(ready)
+    for staging in Path(folder).glob(f"{_STAGING}*"):
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def _move(ready: Path) -> None:
+    """Moves the files of a folder up; begun again, it goes on."""
+    with contextlib.suppress(FileNotFoundError):  # it goes last
+        for name in json.loads((ready / _OLD).read_text(encoding="utf-8")):
+            (ready.parent / name).unlink(missing_ok=True)
+    for file in sorted(ready.iterdir()):
+        if file.name != _OLD:
+            os.replace(file, ready.parent / file.name)
+    shutil.rmtree(ready)
 
 
 def require_writable(folder: str | Path) -> None:

@@ -128,6 +128,15 @@ def test_folder_archive_and_files_in_natural_order(tmp_path: Path):
     assert names == ["front", "scan2"]
 
 
+def test_a_readme_among_scans_is_skipped_with_a_note(tmp_path: Path):
+    np.save(tmp_path / "a.npy", CLOUD)
+    (tmp_path / "b.xyz").write_text("x y z\n1 2 3\n")
+    (tmp_path / "readme.txt").write_text("Scans of 2024\n\nmade by hand, 3 in all\n")
+    with pytest.warns(UserWarning, match=r"readme\.txt: holds no points, skipped"):
+        names, _ = read_scans(tmp_path)
+    assert names == ["a", "b"]
+
+
 def _write(path: Path, content: bytes) -> Path:
     path.write_bytes(content)
     return path

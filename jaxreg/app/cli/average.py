@@ -13,8 +13,9 @@ from rich.table import Table
 from jaxreg._core.status import Status
 from jaxreg.app.cli import outputs
 from jaxreg.app.cli.runtime import Options, Precision, Session
+from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_graph, save_figure, write_graph_report
-from jaxreg.app.result import result_folder, versions, write_json
+from jaxreg.app.result import versions, write_json
 from jaxreg.averaging import (
     AveragingSolution,
     Correntropy,
@@ -24,7 +25,6 @@ from jaxreg.averaging import (
     average,
 )
 from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.io.atomic import require_writable
 from jaxreg.io.errors import InputError
 from jaxreg.io.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
 from jaxreg.io.poses.tum import write_tum
@@ -69,7 +69,6 @@ class Average(Options):
             ids, _ = read_g2o_poses(self.graph)
         for message in {str(w.message) for w in caught}:
             session.console.print(message)
-        require_writable(self.out)
         key = self.key()
         with session.progress() as progress, session.timed("run", computes=True):
             progress("averaging", 0, 2)

@@ -7,7 +7,6 @@ from jaxreg.app.cli.inputs import Scans
 from jaxreg.app.cli.multiview import reconstruct_scans, report, require_two_placed
 from jaxreg.app.cli.runtime import SearchOptions, Session
 from jaxreg.datasets.sculpture import sculpture_scans
-from jaxreg.io.atomic import require_writable
 
 
 @dataclass(frozen=True)
@@ -16,7 +15,6 @@ class Demo(SearchOptions):
 
     def run(self, session: Session) -> int:
         """Runs the command; returns the exit code."""
-        require_writable(self.out)
         key, method = self.key(), self.method()
         session.console.print(
             "Twelve noisy scans of a sculpture 0.2 m tall, each in a frame of its own, "

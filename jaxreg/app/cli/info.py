@@ -11,7 +11,7 @@ import tyro
 
 from jaxreg.app.describe import GRAPHS, GraphFacts, ScanFacts, describe, unit_notes
 from jaxreg.io.errors import InputError
-from jaxreg.io.points.read import point_files
+from jaxreg.io.points.read import point_files, prose_files
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,9 @@ class Info:
             if not isinstance(facts, GraphFacts)
             for scan in facts
         ]
-        notes = unit_notes(scans)
+        skipped = [file for f in self.files for file in prose_files(f)]
+        notes = [f"{file}: holds no points, skipped." for file in skipped]
+        notes += unit_notes(scans)
         if self.json:
             files = [_entry(file, facts) for file, facts in found]
             text = json.dumps({"files": files, "notes": notes}, indent=1)

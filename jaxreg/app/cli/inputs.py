@@ -8,7 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg.io.errors import InputError
-from jaxreg.io.points.read import point_files, read_named, unique_names
+from jaxreg.io.points.read import (
+    point_files,
+    prose_files,
+    read_named,
+    unique_names,
+)
 
 
 # Scans whose extents differ by such a factor are taken to be in different units.
@@ -65,6 +70,7 @@ def load_scans(paths: Sequence[Path]) -> Scans:
     places: list[str] = []
     notes: list[str] = []
     for path in paths:
+        notes += [f"{file}: holds no points, skipped." for file in prose_files(path)]
         found = [
             item
             for file in point_files(path)

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import NoReturn
 
+from jaxreg.app.folder import held
 from jaxreg.app.result import version
 from jaxreg.io.errors import InputError, MissingExtraError
 
@@ -117,8 +118,9 @@ def _run(arguments: list[str]) -> int:
         return command.run()
     line = os.fsencode(shlex.join(["jaxreg", *arguments]))
     session = runtime.Session(command, line.decode("utf-8", "backslashreplace"))
-    with command.computing():
+    with held(command.out), command.computing():
         code = command.run(session)
-    if command.json:
-        sys.stdout.write((command.out / "result.json").read_text(encoding="utf-8"))
+        if command.json:
+            text = (command.out / "result.json").read_text(encoding="utf-8")
+            sys.stdout.write(text)
     return code

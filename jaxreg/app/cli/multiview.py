@@ -19,7 +19,6 @@ from jaxreg.app.cli.runtime import SearchOptions, Session
 from jaxreg.app.pair_log import PairLog, Pairs
 from jaxreg.app.plot.results import result_of
 from jaxreg.app.result import Result, version
-from jaxreg.io.atomic import require_writable
 from jaxreg.io.errors import InputError
 from jaxreg.io.poses.stanford import read_conf
 
@@ -63,7 +62,6 @@ class Multiview(SearchOptions):
             truth = None if self.truth is None else _read_truth(self.truth, scans)
         for note in scans.notes:
             session.console.print(note)
-        require_writable(self.out)
         key, method, log = self.key(), self.method(), self._log(session, scans)
         try:
             with session.progress() as progress, session.timed("run", computes=True):
@@ -95,13 +93,21 @@ class Multiview(SearchOptions):
             "precision": self.precision,
             "version": version("jaxreg"),
         }
-        log = PairLog(self.out / "pairs.jsonl", run, resume=self.resume)
+        log = PairLog(
+            self.out / "pairs.jsonl",
+            run,
+            resume=self.resume,
+            num_scans=len(scans.names),
+            dim=scans.points[0].shape[1],
+        )
+        if log.damage is not None:
+            session.console.print(f"{log.path}: {log.damage}.")
         if not self.resume and log.path.exists():
             session.console.print(
                 f"{log.path}: pairs of an interrupted run, replaced by those of this "
                 "one; --resume would go on with them."
             )
-        if self.resume and not len(log):
+        elif self.resume and not len(log):
             session.console.print(f"{log.path}: no pairs to go on with, all are new.")
         return log
 

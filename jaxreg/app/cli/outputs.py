@@ -12,8 +12,9 @@ from rich.table import Table
 
 from jaxreg._core.status import Status
 from jaxreg.app.cli.runtime import Session
+from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_reconstruction, save_figure, write_report
-from jaxreg.app.result import Result, result_document, result_folder, write_result
+from jaxreg.app.result import Result, result_document, write_result
 from jaxreg.io.errors import MissingExtraError
 from jaxreg.metrics import rotation_errors, translation_errors
 

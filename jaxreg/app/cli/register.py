@@ -16,7 +16,6 @@ from jaxreg.app.cli.inputs import Scans, load_scans
 from jaxreg.app.cli.runtime import SearchOptions, Session
 from jaxreg.app.plot.results import result_of
 from jaxreg.app.result import Result
-from jaxreg.io.atomic import require_writable
 from jaxreg.io.errors import InputError
 
 
@@ -40,7 +39,6 @@ class Register(SearchOptions):
             )
         for note in scans.notes:
             session.console.print(note)
-        require_writable(self.out)
         key, method = self.key(), self.method()
         with session.progress() as progress, session.timed("run", computes=True):
             progress("registering", 0, 1)

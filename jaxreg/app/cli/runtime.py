@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -149,6 +150,8 @@ def _use_device(kind: str) -> None:
 def keep_compiled_programs() -> None:
     """Turns on JAX's cache of compiled programs, in the user's cache folder.
 
+    They run as they lie there, so that the folder must belong to the user and nobody
+    else may write to it; else nothing is kept, which one line on standard error says.
     `JAX_COMPILATION_CACHE_DIR` is honoured, then `XDG_CACHE_HOME`. Must be called
     before the first compilation.
     """
@@ -157,9 +160,23 @@ def keep_compiled_programs() -> None:
     root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(root) / "jaxreg"
     with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if not _is_mine(folder):
+            sys.stderr.write(
+                f"jaxreg: {folder}: others may write there, compiled programs are not "
+                "kept. Remove it, or make it yours alone.\n"
+            )
+            return
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _is_mine(folder: Path) -> bool:
+    if not hasattr(os, "getuid"):  # Windows: profiles are their user's
+        return True
+    found = folder.stat()
+    return found.st_uid == os.getuid() and not found.st_mode & 0o022
 
 
 class _CompileClock:

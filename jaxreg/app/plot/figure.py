@@ -187,7 +187,7 @@ def _legend(
         n + (f" (component {k})" if k > 0 else "" if k == 0 else " (not placed)")
         for n, k in zip(names, component, strict=True)
     ]
-    figure.legend(
+    legend = figure.legend(
         handles,
         labels,
         loc="lower center",
@@ -197,6 +197,8 @@ def _legend(
         handletextpad=0.1,
         columnspacing=1.2,
     )
+    for text in legend.get_texts():
+        text.set_parse_math(False)  # a name may hold $
 
 
 def new_figure(**settings: Any) -> Any:

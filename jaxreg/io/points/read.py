@@ -2,6 +2,7 @@
 
 import os
 import re
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -97,7 +98,8 @@ def read_scans(
     Args:
         paths: each is a file as for `read_points`, an NPZ or E57 file of which every
             scan is read, or a folder, of which all point files are read in natural
-            order (`scan2` before `scan10`).
+            order (`scan2` before `scan10`). Of text files there without numbers, such
+            as a readme, a warning tells that they are skipped.
 
     Returns:
         Names, made of file names without suffix or NPZ keys and unique, and as many
@@ -109,6 +111,8 @@ def read_scans(
     names: list[str] = []
     scans: list[np.ndarray] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
+        for file in prose_files(path):
+            warnings.warn(f"{file}: holds no points, skipped.", stacklevel=2)
         for file in point_files(path):
             found = read_named(file)
             names += found.keys()
@@ -146,21 +150,44 @@ def read_named(
 def point_files(path: str | Path) -> list[Path]:
     """The point files of a folder in natural order; a file stands for itself.
 
+    Text files without a row of numbers, such as a readme, are left out, see
+    `prose_files`.
+
     Raises:
         InputError: if a folder holds no point file.
     """
     path = Path(path)
     if not path.is_dir():
         return [path]
-    files = [
-        f
-        for f in path.iterdir()
-        if f.is_file() and not f.name.startswith(".") and _suffix(f) in SUFFIXES
-    ]
+    prose = prose_files(path)
+    files = [f for f in _candidates(path) if f not in prose]
     if not files:
         raise InputError(
             f"{path}: the folder holds no point files.\nWanted {_FORMATS}."
         )
+    return files
+
+
+def prose_files(path: str | Path) -> list[Path]:
+    """The text files of a folder that hold no row of numbers; none of a file.
+
+    Raises:
+        InputError: if the folder cannot be read.
+    """
+    if not Path(path).is_dir():
+        return []
+    found = [f for f in _candidates(Path(path)) if _suffix(f) in TEXT]
+    return [f for f in found if not text.has_rows(text_lines(f))]
+
+
+def _candidates(folder: Path) -> list[Path]:
+    """Files of a folder whose suffix is one of points, in natural order."""
+    with reading(folder, "folder", "Check its name and permissions."):
+        files = [
+            f
+            for f in folder.iterdir()
+            if f.is_file() and not f.name.startswith(".") and _suffix(f) in SUFFIXES
+        ]
     return sorted(files, key=lambda f: _natural(f.name))
 
 

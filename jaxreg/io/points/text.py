@@ -85,6 +85,15 @@ def parse_text(
     return points, layout.fields
 
 
+def has_rows(lines: Iterable[Line]) -> bool:
+    """Whether one of the first lines holds two numbers, or they are no text at all."""
+    try:
+        found, _ = _first_lines(iter(lines))
+    except InputError:
+        return True  # the reader says what is wrong
+    return not found or any(_has_numbers(line) for _, line in found)
+
+
 class _Counted:
     """An iterator that knows how many lines passed."""
 

@@ -224,3 +224,19 @@ def test_names_that_are_no_utf_8(
     assert found["names"] == [rf"scan\xff{k}" for k in range(3)]
     assert main(["info", *scans]) == 0
     assert r"scan\udcff0.npy: 3D scan" in capsys.readouterr().out
+
+
+def test_a_readme_and_a_damaged_log_are_said_and_the_run_goes_on(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (folder / "scans").mkdir()
+    save_scans(folder / "scans")
+    (folder / "scans" / "readme.txt").write_text("not a point in here\n")
+    (folder / "jaxreg-out").mkdir()
+    (folder / "jaxreg-out" / "pairs.jsonl").write_bytes(bytes(range(256)) * 4)
+    fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    assert main(["multiview", "scans", "--resume"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "readme.txt: holds no points, skipped." in said
+    assert "pairs.jsonl: damaged from its first line on, all pairs are new." in said
+    assert sorted(os.listdir("jaxreg-out")) == FILES

@@ -38,6 +38,15 @@ def test_reconstruction_figure_shows_points(tmp_path: Path, d: int):
         assert np.mean(np.any(panel < 0.95, axis=-1)) > 0.001
 
 
+def test_names_are_no_formulas(tmp_path: Path):
+    scans = [_sphere(50)[:, :2] for _ in range(3)]
+    T = np.tile(np.eye(3), (3, 1, 1))
+    names = ["$a", r"$\frac{$", "_b$x^$"]
+    figure = draw_reconstruction(scans, T, names, component=[0, 0, 1])
+    save_figure(tmp_path / "figure.png", figure)
+    assert _painted(tmp_path / "figure.png") > 0
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_every_component_has_a_row(tmp_path: Path, d: int):
     scans = [_sphere(800)[:, :d] for _ in range(4)]
