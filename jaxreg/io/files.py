@@ -21,6 +21,7 @@ AGAIN = "Export the scan again, or as PLY."
 _MOST_RATIO = 200
 _FREE_SIZE = 16_000_000
 _LONGEST_LINE = 1_000_000
+_PIPED = "Write its content to a file first, and name that."
 _KINDS = (
     (stat.S_ISFIFO, "a named pipe"),
     (stat.S_ISCHR, "a device"),
@@ -87,7 +88,7 @@ def require_regular(path: str | Path) -> int:
         if is_kind(found.st_mode):
             raise InputError(
                 f"{path}: cannot be read ({what}, not a file).\n"
-                "Write its content to a file first, and name that."
+                + ("Name a file in it." if what == "a folder" else _PIPED)
             )
     return found.st_size
 

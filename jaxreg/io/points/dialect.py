@@ -148,10 +148,9 @@ def coordinates(
         )
     axes = _axes(names)
     if len(names) != width:
-        if (
-            "x" in axes
-            and [axes.get(a) for a in "xyz"[: len(axes)]] != [0, 1, 2][: len(axes)]
-        ):
+        # `x y z` before colours that have no names is usual.
+        usual = list(axes.values()) == list(range(min(3, len(numeric))))
+        if {"x", "y"} <= axes.keys() and not usual:
             raise InputError(
                 f"{path}: has {width} columns, but names {len(names)}: "
                 f"{' '.join(names)[:60]!r}.\nName each column once, or none."

@@ -17,6 +17,7 @@ from jaxreg.io.points.thinning import Step, byte_lines, number_rows, records
 
 
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("tag", "<u2")])
+_LONGEST = 1_000_000  # of a line that goes on
 _Scan = tuple[np.ndarray, tuple[str, ...], int]
 
 
@@ -91,7 +92,7 @@ def _distinct(points: np.ndarray, path: Path, step: Step) -> _Scan:
 def _obj(file: io.BufferedIOBase, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """All vertices, `(n, 3)`, and the numbers of those that a face names."""
     vertices, faces = array("d"), array("q")
-    for number, line in enumerate(byte_lines(file), start=1):
+    for number, line in _joined(byte_lines(file)):
         word, *values = line.split(b"#")[0].split() or [b""]
         try:
             if word == b"v":
@@ -117,6 +118,19 @@ def _obj(file: io.BufferedIOBase, path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"a face names vertex {used.max() + 1}, there are {len(points)}"
         )
     return points, used
+
+
+def _joined(lines: Iterator[bytes]) -> Iterator[tuple[int, bytes]]:
+    """Lines with their numbers; one that ends in a backslash goes on in the next."""
+    before = b""
+    for number, line in enumerate(lines, start=1):
+        if line.rstrip().endswith(b"\\") and len(before) < _LONGEST:
+            before += line.rstrip()[:-1] + b" "
+        else:
+            yield number, before + line
+            before = b""
+    if before:
+        raise ValueError("it ends in a backslash")
 
 
 def _require_face(named: list[int], num: int) -> None:

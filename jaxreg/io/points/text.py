@@ -131,13 +131,20 @@ def _layout(
     """What the lines say, and those that are rows."""
     require_points([line for _, line in lines], path)
     count: int | None = None
+    commented = True
+    for number, line in lines[:2]:
+        if line.count('"') % 2:
+            raise InputError(
+                f"{path}, line {number}: a quotation mark that nothing closes.\n"
+                "Write each row on a line of its own."
+            )
     for _ in range(2):
         start = lines[0][1].strip() if lines else ""
         if count is None and start.isascii() and start.isdigit() and len(lines) > 1:
             count = int(start)
             lines = lines[1:]
         elif lines and not _has_numbers(lines[0][1]):
-            heads = [lines[0][1].strip()]
+            heads, commented = [lines[0][1].strip()], False
             lines = lines[1:]
     if not lines or not _has_numbers(lines[0][1]):
         raise InputError(
@@ -148,6 +155,8 @@ def _layout(
     rows = [dialect.cells(line) for _, line in lines]
     numeric = _numeric_columns(rows, lines, path)
     names = dialect.cells(heads[0]) if heads else []
+    if commented and len(names) != len(rows[0]):
+        names = []  # a comment like any other
     columns, fields = coordinates(names, numeric, len(rows[0]), path)
     _require_first_row(rows, columns, lines, path)
     needed = max(numeric) + 1
