@@ -67,12 +67,12 @@ def require_points(lines: Sequence[str], path: Path) -> None:
         return
     table = np.array(rows)
     if table.shape == (4, 4) and (table[3] == [0, 0, 0, 1]).all():
-        raise refusal(path, "one motion, a 4 x 4 matrix,", "numpy.loadtxt")
+        raise refusal(path, "one motion, a 4 x 4 matrix", "numpy.loadtxt")
     if widths[0] == 12 and _are_motions(table.reshape(-1, 3, 4)):
-        raise refusal(path, "poses, 3 x 4 matrices,", "jaxreg.io.read_kitti")
+        raise refusal(path, "poses, 3 x 4 matrices", "jaxreg.io.read_kitti")
     norms = np.linalg.norm(table[:, 4:], axis=1) if widths[0] == 8 else np.zeros(1)
     if len(table) > 1 and np.abs(norms - 1).max() < 1e-3:
-        raise refusal(path, "poses with quaternions,", "jaxreg.io.read_tum")
+        raise refusal(path, "poses with quaternions", "jaxreg.io.read_tum")
 
 
 def _are_motions(T: np.ndarray) -> bool:
