@@ -22,8 +22,7 @@ from jaxreg.averaging import (
     SpanningTree,
     average,
 )
-from jaxreg.averaging.base import length_scale
-from jaxreg.averaging.evidence import agreement
+from jaxreg.averaging.measures import length_scale
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_errors, translation_errors
 from tests.averaging.graphs import random_graph
@@ -132,3 +131,11 @@ def errors_of(graph: PoseGraph, T, T_true) -> tuple:
     margin = agreement(graph, T, scale) - agreement(graph, T_true, scale)
     frames = jnp.max(jnp.mean(right, axis=1))
     return jnp.mean(rotation), jnp.mean(translation), frames, margin
+
+
+def agreement(graph: PoseGraph, T, scale) -> jax.Array:
+    """Edges that agree, summed over errors from half a radian down by octaves."""
+    rotation, translation = graph.differences(T)
+    sq = rotation / 2 + translation / scale**2
+    width = (0.5 / 2 ** jnp.arange(8))[:, None]
+    return jnp.sum(jnp.exp(-sq / (2 * width**2)))

@@ -27,6 +27,7 @@ class Status(enum.IntEnum):
     DISCONNECTED = 7
     DIVERGED = 8
     UNIT_DIFFERS = 9
+    NO_AGREEMENT = 10
 
     @property
     def advice(self) -> str:
@@ -69,6 +70,11 @@ _ADVICE = {
     Status.UNIT_DIFFERS: (
         "The scan is many times larger or smaller than the others, and was left out. "
         "Is it in another unit? Bring all scans to one unit."
+    ),
+    Status.NO_AGREEMENT: (
+        "No motions agree with each other beyond what any tree of them agrees with by "
+        "itself, so the poses are a guess. Register again with more overlap, or add "
+        "edges."
     ),
     Status.DISCONNECTED: (
         "The trusted edges do not reach every pose. See `placed`, and `component` "

@@ -80,7 +80,9 @@ def average(
         frame 0 by edges of positive weight, see `placed`.
         NON_FINITE: edges or poses with NaN or inf were met; such edges are ignored,
         such poses returned as the identity.
-        MAX_STEPS: the steps ran out.
+        MAX_STEPS: the steps ran out. NO_AGREEMENT, of `Correntropy`: there are more
+        motions than a tree needs, and nothing agrees beyond what any tree agrees with
+        (`log_evidence` is at most 0).
 
     Raises:
         TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,

@@ -177,6 +177,7 @@ def _cut(found: AveragingSolution, lane: int, graph: PoseGraph) -> AveragingSolu
         kernel_width=put(found.kernel_width[lane]),
         num_steps=put(found.num_steps[lane]),
         residual=put(found.residual[lane]),
+        log_evidence=put(found.log_evidence[lane]),
         length_scale=put(found.length_scale[lane]),
         trace=jax.tree.map(lambda x: put(x[lane]), found.trace),
     )

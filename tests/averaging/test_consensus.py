@@ -5,13 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.averaging import CycleConsensus, PoseGraphLM, average
-from jaxreg.averaging.base import length_scale
-from jaxreg.averaging.evidence import agreement, coherence
 from jaxreg.averaging.start.cycles import NEUTRAL, edge_log_odds, judged
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_error, rotation_errors
 from tests.averaging.graphs import (
-    folding_graph,
     motions,
     noisy_grid,
     random_graph,
@@ -90,44 +87,6 @@ def test_graphs_too_large_for_cycles_take_short_paths_or_the_heaviest_tree():
     assert not judged(graph)
     found = average(graph, CycleConsensus()).T_world_i
     np.testing.assert_allclose(found, X, atol=1e-4)
-
-
-def test_coherence_against_a_loop_over_frames():
-    num = 40
-    X, edges, T, _ = random_graph(num, 500, 0.3, 0)
-    scale, near, agrees = 0.7, {v: [] for v in range(num)}, []
-    for (i, j), M in zip(edges.tolist(), T, strict=True):
-        P = np.linalg.inv(X[i]) @ X[j]
-        gap = ((P - M)[:3, :3] ** 2).sum() / 2 + ((P - M)[:3, 3] ** 2).sum() / scale**2
-        far = 3 - np.trace(P[:3, :3]) + (P[:3, 3] ** 2).sum() / scale**2
-        agrees.append(
-            np.mean([1 / (1 + (gap / w**2) ** 2) for w in (0.4, 0.2, 0.1, 0.05, 0.025)])
-        )
-        near[i].append((far, agrees[-1]))
-        near[j].append((far, agrees[-1]))
-    own = np.mean([[a for _, a in sorted(near[v])[:4]] for v in range(num)])
-    mean = np.mean(agrees)
-    own = max(own - 2 * np.sqrt(mean * (1 - mean) / (2 * num)), mean)
-    select = (1 - 8 / 25) ** 3
-    found = coherence(
-        single(X, edges, T), jnp.asarray(X, jnp.float32), jnp.float32(scale)
-    )
-    expected = 3 * select * own + mean
-    np.testing.assert_allclose(found, expected, rtol=1e-3)
-
-
-def test_the_truth_is_more_coherent_than_a_larger_group_of_wrong_motions():
-    @jax.jit
-    def scores(graph, T):
-        scale = length_scale(graph)
-        return coherence(graph, T, scale), agreement(graph, T, scale)
-
-    for seed in range(3):
-        X, folded, edges, T = folding_graph(seed)
-        graph = single(X, edges, T)
-        true, wrong = (scores(graph, jnp.asarray(P, jnp.float32)) for P in (X, folded))
-        assert wrong[1] > 1.3 * true[1]
-        assert true[0] > 1.1 * wrong[0]
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.5])

@@ -4,7 +4,7 @@ import pytest
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import LowRankSparse, average
-from jaxreg.averaging.base import length_scale
+from jaxreg.averaging.measures import length_scale
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import random_graph
 

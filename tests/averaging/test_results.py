@@ -7,8 +7,8 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import MotionAveraging, average, pose_covariances
-from jaxreg.averaging.base import length_scale
 from jaxreg.averaging.covariance import COVARIANCE_LIMIT, _deviations
+from jaxreg.averaging.measures import length_scale
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import motions, random_graph, rotations
 

@@ -118,6 +118,7 @@ def _covariances(T_world_i: np.ndarray, edges: np.ndarray, T_i_j: np.ndarray) ->
         kernel_width=jnp.full(2, jnp.inf, dtype),
         num_steps=jnp.zeros((), jnp.int32),
         residual=jnp.zeros((), dtype),
+        log_evidence=jnp.zeros((), dtype),
         length_scale=jnp.ones((), dtype),
     )
     return jaxreg.pose_covariances(graph, solution)

@@ -5,8 +5,6 @@ Maximum Correntropy Criterion (the MCC paper); start, widths and steps go beyond
 `MCC` is the published algorithm.
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,14 +12,11 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_parts
+from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import (
-    AbstractAverager,
-    AveragingSolution,
-    length_scale,
-    start,
-)
-from jaxreg.averaging.evidence import coherence, redundancy
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, start
+from jaxreg.averaging.likelihood import explained
+from jaxreg.averaging.measures import length_scale, num_held
 from jaxreg.averaging.methods.graduated import graduated
 from jaxreg.averaging.methods.motion_averaging import iterate_plain
 from jaxreg.averaging.start.closures import without_lone_closures
@@ -38,16 +33,13 @@ from jaxreg.averaging.steps.kernel_width import (
     gaussian_trust,
 )
 from jaxreg.averaging.steps.rows import RootRows
-from jaxreg.averaging.trace import AveragingTrace, no_rows
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import along_frames
 from jaxreg.linear.laplacian import DENSE_LIMIT
 
 
-# Kernels of at most this width, radians and length scales, hold on to a start.
-_NARROW = 0.25
-# Share of the other end's agreement beyond a tree that an end must reach.
-_ENOUGH = 0.7
+# Widths that are tried at most: down to an eighth of the first.
+_WIDTHS = 4
 
 
 class Correntropy(AbstractAverager):
@@ -57,8 +49,7 @@ class Correntropy(AbstractAverager):
     the start, and a kernel whose widths for rotation and translation shrink to three
     standard deviations of the noise that the agreeing edges show. Up to `DENSE_LIMIT`
     frames the steps are those of Gauss-Newton, in which each part counts at its
-    precision, or by `information` where the graph has it; a wide kernel may draw a
-    start to a larger, less coherent group, so a narrow one is tried, too.
+    precision, or by `information` where the graph has it.
     Larger graphs take `graduated` steps; where those leave many edges out, the chain of
     successive frames is tried as a start, and that no motion is wrong.
 
@@ -96,59 +87,44 @@ class Correntropy(AbstractAverager):
         if graph.num_poses > DENSE_LIMIT:
             return self._large(graph, init, key)
         T_start = start(self.initialiser, graph, init, key)
-        return self._small(graph, T_start, init is None)
+        return self._small(graph, T_start)
 
     @eqx.filter_jit
     def _large(
         self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
     ) -> AveragingSolution:
-        return solution_of(graph, self._graduated(graph, init, key))
+        return _judged(graph, self._graduated(graph, init, key))
 
     @eqx.filter_jit
     def _small(
-        self, graph: PoseGraph, T_start: Float[Array, "v D D"], compare: bool
+        self, graph: PoseGraph, T_start: Float[Array, "v D D"]
     ) -> AveragingSolution:
-        return solution_of(graph, self._annealed(graph, T_start, compare))
+        return _judged(graph, self._annealed(graph, T_start))
 
-    def _annealed(
-        self, graph: PoseGraph, T_start: Float[Array, "v D D"], compare: bool
-    ) -> Iterated:
-        """Ends from a wide kernel or, where more coherent, from a narrow one."""
+    def _annealed(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
+        """From the likeliest width; from half of it where that loses likelihood.
+
+        A kernel that is too wide draws poses to a larger group of edges that agree
+        less well.
+        """
         fixed, T_start = jax.lax.stop_gradient((graph, T_start))
-        scale = length_scale(fixed)
-        followed = eqx.Partial(followed_width, scale)
-        T_wide = _better_start(fixed, T_start, fixed)
-        width = first_width(fixed, T_wide)
-        if not compare:
-            end = self._from_width(fixed, T_wide, width)
-            return gauss_newton_gradients(graph, end, gaussian_trust, followed)
-        narrow = jnp.minimum(width, _NARROW * jnp.stack([scale, jnp.ones_like(scale)]))
-        doubt = (width[1] > _NARROW) | jnp.any(T_wide != T_start)
+        followed = eqx.Partial(followed_width, length_scale(fixed))
+        T = _better_start(fixed, T_start, fixed)
+        least = explained(fixed, T).log_ratio
+        width = first_width(fixed, T)
 
-        def tried(number: Array, best: _Tried) -> _Tried:
-            first = number == 0
-            T = jnp.where(first, T_wide, T_start)
-            end = self._from_width(fixed, T, jnp.where(first, width, narrow))
-            score = coherence(fixed, end.T_world_i, scale)
-            # A kernel narrower than the noise fits a tree, and little beyond.
-            spare = redundancy(fixed, end.T_world_i)
-            better = first | (
-                (score > best.score) & (spare > _ENOUGH * best.redundancy)
-            )
-            new = _Tried(end, score, spare)
-            return jax.tree.map(lambda new, old: jnp.where(better, new, old), new, best)
+        def narrower(tried: tuple[Array, Array, Iterated]) -> tuple:
+            number = tried[0]
+            end = self._from_width(fixed, T, width / 2**number)
+            return number + 1, explained(fixed, end.T_world_i).log_ratio, end
 
-        zero = jnp.asarray(0, jnp.int32)
-        nowhere = Iterated(
-            T_start,
-            jnp.zeros_like(graph.weight),
-            width,
-            jnp.asarray(False),
-            zero,
-            AveragingTrace.of(no_rows(self.max_steps, width.dtype), zero),
+        blank = jax.eval_shape(lambda: self._from_width(fixed, T, width))
+        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
+        _, _, end = jax.lax.while_loop(
+            lambda tried: (tried[1] < least) & (tried[0] < _WIDTHS),
+            narrower,
+            (jnp.asarray(0, jnp.int32), jnp.full_like(least, -jnp.inf), blank),
         )
-        none = _Tried(nowhere, jnp.zeros_like(scale), jnp.zeros_like(scale))
-        end = jax.lax.fori_loop(0, jnp.where(doubt, 2, 1), tried, none).end
         return gauss_newton_gradients(graph, end, gaussian_trust, followed)
 
     def _from_width(self, graph: PoseGraph, T_start: Array, width: Array) -> Iterated:
@@ -178,12 +154,14 @@ class Correntropy(AbstractAverager):
         return graduated(graph, near, jnp.stack(starts), self.max_steps)
 
 
-class _Tried(NamedTuple):
-    """Where a start led, and how well that agrees."""
-
-    end: Iterated
-    score: Array
-    redundancy: Array
+def _judged(graph: PoseGraph, end: Iterated) -> AveragingSolution:
+    """The solution; NO_AGREEMENT if there are edges to spare, and none agrees."""
+    found = solution_of(graph, end)
+    spare = jnp.sum(graph.weight > 0) > num_held(graph) - 1
+    status = jnp.where(
+        spare & (found.log_evidence <= 0), Status.NO_AGREEMENT, found.status
+    )
+    return eqx.tree_at(lambda s: s.status, found, status.astype(jnp.int32))
 
 
 def _better_start(
@@ -191,7 +169,7 @@ def _better_start(
     T_start: Float[Array, "v D D"],
     near: PoseGraph,
 ) -> Float[Array, "v D D"]:
-    """The start, or what a few plain steps make of it if more edges agree with that.
+    """The start, or what a few plain steps make of it if that is likelier.
 
     A chain of good edges drifts: its loop closures then look wrong, and a redescending
     kernel would drop them. Plain averaging spreads the drift; with wrong edges about,
@@ -199,5 +177,5 @@ def _better_start(
     """
     plain = iterate_plain(near, T_start, RootRows(), max_steps=5, tolerance=1e-2)
     both = jnp.stack([T_start, plain.T_world_i])
-    spare = jax.vmap(lambda T: redundancy(graph, T))(both)
-    return jnp.where(spare[1] > spare[0], both[1], both[0])
+    ratio = jax.lax.map(lambda T: explained(graph, T).log_ratio, both)
+    return jnp.where(ratio[1] > ratio[0], both[1], both[0])

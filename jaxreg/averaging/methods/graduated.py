@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.base import (
+from jaxreg.averaging.likelihood import SETTLED, agreed_share, explained
+from jaxreg.averaging.measures import (
     length_scale,
     nearest_rank,
     num_held,
     weighted_mean,
 )
-from jaxreg.averaging.evidence import redundancies, redundancy
 from jaxreg.averaging.steps.edge_errors import LogError
 from jaxreg.averaging.steps.gauss_newton import gauss_newton_gradients, precisions
 from jaxreg.averaging.steps.iterate import Iterated, pose_change
@@ -46,8 +46,6 @@ _ROUNDS = 24
 _SAME = 0.9
 # Wide enough to be none.
 _NO_KERNEL = 1e6
-# No other start is tried if this share of the redundant edges is trusted.
-_SETTLED = 0.99
 # The first width of chained starts: so many times the error at this quantile of the
 # edges that do not hold, where lone closures are doubted and where none are.
 _SIFTED, _UNSIFTED = (4.0, 0.98), (2.0, 0.25)
@@ -90,14 +88,16 @@ def graduated(
     """
     fixed, near, starts = jax.lax.stop_gradient((graph, near, starts))
     believed = (fixed.weight > 0) & (near.weight == fixed.weight)
+    certain = eqx.tree_at(
+        lambda g: g.weight, fixed, jnp.where(believed, fixed.weight, 0)
+    )
     doubt = near.weight / jnp.where(fixed.weight > 0, fixed.weight, 1)
 
     def attempt(b: _Best) -> _Best:
         every = b.tried == starts.shape[0]
         T_start = jnp.where(every, b.end.found.T, starts[b.tried])
         end = _narrowed(fixed, doubt, T_start, every, max_steps)
-        trust = _trust_at(end, fixed, end.found.T)
-        score = redundancy(fixed, end.found.T)
+        score = explained(fixed, end.found.T).log_ratio
         steps = b.end.found.step + end.found.step
         better = score > b.score
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, b.end)
@@ -106,13 +106,12 @@ def graduated(
             best,
             jnp.maximum(score, b.score),
             b.tried + 1,
-            (_redundant_share(believed, trust, num_held(fixed)) > _SETTLED)
-            & _tight(fixed, believed, end.found.T),
+            agreed_share(certain, end.found.T) > SETTLED,
         )
 
     begin = _Best(
         _before(fixed, doubt, starts[0], jnp.asarray(False)),
-        -jnp.ones((), starts.dtype),
+        -jnp.full((), jnp.inf, starts.dtype),
         jnp.asarray(0, jnp.int32),
         jnp.asarray(False),
     )
@@ -192,19 +191,6 @@ def _narrowed(
     scale = length_scale(graph)
     start = _before(graph, doubt, T_start, every)
     return jax.lax.while_loop(lambda s: ~s.done, turn, start)
-
-
-def _redundant_share(believed: Array, trust: Array, frames: Array) -> Array:
-    """Trusted edges over all believed ones, beyond those that a tree takes."""
-    tree = frames - 1
-    trusted = jnp.sum(believed & (trust > 0.5)) - tree
-    return trusted / jnp.maximum(jnp.sum(believed) - tree, 1)
-
-
-def _tight(graph: PoseGraph, believed: Array, T_world_i: Array) -> Array:
-    """Do the edges agree at the coarsest scale, and not just under a wide kernel?"""
-    spare = jnp.sum(believed) - (num_held(graph) - 1)
-    return redundancies(graph, T_world_i)[0] > 0.5 * spare
 
 
 def _first_width(graph: PoseGraph, believed: Array, T: Array, squares: Array) -> Array:

@@ -18,12 +18,8 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_positive
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.typing import Key, Scalar
-from jaxreg.averaging.base import (
-    AbstractAverager,
-    AveragingSolution,
-    length_scale,
-    solution,
-)
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
+from jaxreg.averaging.measures import length_scale
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import DENSE_LIMIT

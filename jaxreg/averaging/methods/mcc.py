@@ -18,14 +18,8 @@ from jaxreg._core.checks import (
     check_positive,
 )
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import (
-    AbstractAverager,
-    AveragingSolution,
-    frobenius,
-    length_scale,
-    start,
-    weighted_mean,
-)
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, start
+from jaxreg.averaging.measures import frobenius, length_scale, weighted_mean
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus
 from jaxreg.averaging.steps.iterate import (
     averaging_gradients,

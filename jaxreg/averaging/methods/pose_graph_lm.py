@@ -16,12 +16,7 @@ from jaxreg._core.checks import (
     check_positive,
 )
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import (
-    AbstractAverager,
-    AveragingSolution,
-    solution,
-    start,
-)
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution, start
 from jaxreg.averaging.methods.motion_averaging import MotionAveraging
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError, LogError
 from jaxreg.averaging.steps.implicit import differentiable

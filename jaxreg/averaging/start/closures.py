@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxreg.averaging.base import length_scale
+from jaxreg.averaging.measures import length_scale
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph, product

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.base import length_scale
-from jaxreg.averaging.evidence import prior_odds
+from jaxreg.averaging.likelihood import prior_odds
+from jaxreg.averaging.measures import length_scale
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import DENSE_LIMIT

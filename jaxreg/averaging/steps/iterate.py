@@ -10,12 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import loop
 from jaxreg._core.typing import Scalar
-from jaxreg.averaging.base import (
-    AveragingSolution,
-    length_scale,
-    solution,
-    weighted_mean,
-)
+from jaxreg.averaging.base import AveragingSolution, solution
+from jaxreg.averaging.measures import length_scale, weighted_mean
 from jaxreg.averaging.steps.implicit import differentiable
 from jaxreg.averaging.steps.rows import AbstractRows
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row

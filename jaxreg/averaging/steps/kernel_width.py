@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.base import length_scale, nearest_rank, num_held
-from jaxreg.averaging.evidence import SCALES, redundancies
+from jaxreg.averaging.likelihood import explained
+from jaxreg.averaging.measures import length_scale, nearest_rank, num_held
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.small import inverse
 
@@ -37,13 +37,9 @@ def first_width(
 ) -> Float[Array, "2"]:
     """A width that sees the right edges from the start, and few others.
 
-    Four times the scale at which the edges that agree, beyond those of a tree, say
-    most: fine agreement says more than coarse. Wrong motions that agree with each
-    other roughly draw a start to themselves under a wider kernel.
+    Three of the likeliest deviations, and half of the octave between those compared.
     """
-    found = redundancies(graph, T_world_i)
-    rank = jnp.arange(1, len(SCALES) + 1, dtype=found.dtype)
-    width = 4 * jnp.asarray(SCALES, found.dtype)[jnp.argmax(rank * found)]
+    width = _DEVIATIONS * 2**0.5 * explained(graph, T_world_i, alone=True).deviation
     return jnp.stack([width * length_scale(graph), width])
 
 

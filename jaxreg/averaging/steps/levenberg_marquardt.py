@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.typing import Scalar
-from jaxreg.averaging.base import length_scale, weighted_mean
+from jaxreg.averaging.measures import length_scale, weighted_mean
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError
 from jaxreg.averaging.steps.iterate import nearby_rotation, pose_change
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row

@@ -1,0 +1,1 @@
+"""Studies behind choices of the library: scripts, and what they said."""

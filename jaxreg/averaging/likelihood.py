@@ -1,0 +1,207 @@
+"""How well poses explain motions: one likelihood ratio, without a noise level.
+
+Edge e is right with probability p, wrong otherwise. Its error r (radians, and lengths
+in `length_scale`) has k components, k = 6 or 3.
+
+* The error of a right edge is normal with deviation s in each component. All edges
+  share s, which is unknown: the mean over a ladder of octaves, each as likely.
+* Wrong motions fill the volume V of all motions whose mean length is one. Where each
+  fails on its own, their density is 1 / V, and an error r is so many times likelier of
+  a right edge:
+
+      g(r, s) = (R / s)^D exp(-r^2 / (2 s^2)),   R = V^(1/k) / sqrt(2 pi),   D = k.
+
+  So much for the question whether anything agrees (`log_evidence`). But an object that
+  looks alike from two sides gives wrong motions that agree with each other, and
+  surfaces that slide give such as nearly do: the share of wrong motions within r of
+  where some poses want them falls as r^D with a smaller D, their effective dimension.
+  That is the D for the question which of several poses are right (`explained`).
+* Registration fails for views far apart and seldom for near ones. So p is one number
+  for the edges to the nearest t measured neighbours of one of their ends, as the poses
+  place them, and another, no larger, for those beyond. Both, and t, are unknown.
+* A prior weight w, over the middle one, multiplies the odds: p / (1 - p) w.
+* The poses are fitted to the same motions. Integrating them out (Laplace's method)
+  costs each of the n - 1 that are free the factor (R / s)^D, which is what an edge that
+  holds exactly gains: a tree that agrees with its own edges alone has no evidence.
+
+Together, against "every motion is wrong",
+
+    Lambda = mean over s, t, p_near >= p_far of
+             (R / s)^(-D (n - 1)) product over e of (1 - p_e + p_e g(r_e, s)).
+
+What is left out: the determinant of the reduced Laplacian, which differs little between
+hypotheses, and that rotation and translation may have deviations of their own.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxreg.averaging.measures import length_scale, nearest_rank, num_held
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import PoseGraph, product
+
+
+#: Deviations of right edges, radians and length scales: octaves from where the normal
+#: law is hardly narrower than V to a quarter of a degree.
+DEVIATIONS = tuple(0.5 / 2**k for k in range(8))
+# The effective dimension D of wrong motions. From real scenes and graphs of half wrong
+# motions (`bench/studies/averaging_objective.md`, the half to choose on): 0.6 to 0.8.
+_DIMENSION = 0.8
+# Log odds that p may have: from 1 to 99 %, of near views one half at least.
+_LOG_ODDS, _EVEN = (-4.5, -3.0, -1.5, 0.0, 1.5, 3.0, 4.5), 3
+#: Poses that agree with more than this share of believed edges need no search: noise
+#: leaves out about one of a hundred right ones.
+SETTLED = 0.98
+# Neighbours t that may be near. With 2 as well, sparse graphs agree by chance.
+_NEAREST = (4, 8)
+
+
+class Explained(NamedTuple):
+    """What poses make of motions.
+
+    Attributes:
+        log_ratio: log Lambda; among several poses of a graph the greatest is likeliest.
+        deviation: the likeliest s, in radians and length scales.
+        log_odds: `(e,)` that each edge is right, at the likeliest s, t and p; -inf for
+            absent edges.
+    """
+
+    log_ratio: Float[Array, ""]
+    deviation: Float[Array, ""]
+    log_odds: Float[Array, " e"]
+
+
+def log_evidence(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+) -> Float[Array, ""]:
+    """Log Lambda where each wrong motion is wrong on its own.
+
+    At most 0 if nothing agrees beyond what a tree agrees with. Does not depend on the
+    unit of length, the order of frames and edges, or a common motion of the poses.
+    Memory in proportion to the edges. All frames of a graph are joined.
+
+    Gradients: none (cut).
+    """
+    return explained(graph, T_world_i, alone=True).log_ratio
+
+
+def explained(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"], *, alone: bool = False
+) -> Explained:
+    """Log Lambda, and what is likeliest.
+
+    Args:
+        graph: whose frames are all joined.
+        T_world_i: `(v, d+1, d+1)`.
+        alone: each wrong motion is wrong on its own (D = k), and the deviation is that
+            of a component; else wrong ones may agree with each other.
+
+    Gradients: none (cut).
+    """
+    dimension = lie.tangent_dim(graph.dim) if alone else _DIMENSION
+    return _explained(graph, T_world_i, float(dimension))
+
+
+def agreed_share(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+) -> Float[Array, ""]:
+    """The share of the edges that are likelier right than wrong; 0 without edges."""
+    right = explained(graph, T_world_i).log_odds > 0
+    count = jnp.maximum(jnp.sum(graph.weight > 0), 1)
+    return jnp.sum(right) / count.astype(graph.weight.dtype)
+
+
+def _explained(graph: PoseGraph, T_world_i: Array, dimension: float) -> Explained:
+    graph, T_world_i = jax.lax.stop_gradient((graph, T_world_i))
+    sq, weigh = squared_errors(graph, T_world_i), prior_odds(graph)
+    log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
+    prior = log_odds[:, None] + weigh
+    none = jax.nn.softplus(prior)
+    rank = _neighbour_rank(graph, T_world_i)[None]
+    bound = jnp.asarray((*_NEAREST, jnp.iinfo(rank.dtype).max))[:, None]
+    is_near = (rank < bound).astype(sq.dtype)  # (t + 1, e)
+    band = jnp.diff(is_near, axis=0, prepend=0)
+    number = jnp.arange(len(_LOG_ODDS))
+    allowed = (number[:, None] >= number) & (number[:, None] >= _EVEN)  # near, far
+    free, reach = num_held(graph) - 1, _reach(graph.dim)
+
+    def log_gain(deviation: Array) -> tuple[Array, Array]:
+        """The logarithm of g for each edge, and for one that holds exactly."""
+        most = dimension * jnp.log(reach / deviation)
+        return most - sq / (2 * deviation**2), most
+
+    def terms(deviation: Array) -> Array:
+        gain, most = log_gain(deviation)
+        each = jnp.where(graph.weight > 0, jax.nn.softplus(prior + gain) - none, 0)
+        part = jnp.matmul(each, band.T, precision=jax.lax.Precision.HIGHEST)
+        near = jnp.cumsum(part, axis=1)[:, :-1]
+        far = jnp.cumsum(part[:, ::-1], axis=1)[:, -2::-1]
+        both = near[:, None] + far[None]  # near, far, t
+        return jnp.where(allowed[..., None], both, -jnp.inf) - free * most
+
+    ladder = jnp.asarray(DEVIATIONS, sq.dtype)
+    every = jax.lax.map(terms, ladder)
+    count = len(DEVIATIONS) * len(_NEAREST) * jnp.sum(allowed)
+    s, near, far, t = jnp.unravel_index(jnp.argmax(every), every.shape)
+    p = jnp.where(is_near[t] > 0, log_odds[near], log_odds[far])
+    right = p + weigh + log_gain(ladder[s])[0]
+    ratio = jax.nn.logsumexp(every) - jnp.log(count.astype(sq.dtype))
+    return Explained(
+        jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf),
+        ladder[s],
+        jnp.where(graph.weight > 0, right, -jnp.inf),
+    )
+
+
+def squared_errors(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+) -> Float[Array, " e"]:
+    """Squared angle (chordal) plus squared length over `length_scale` of each edge."""
+    rotation, translation = graph.differences(T_world_i)
+    return rotation / 2 + translation / length_scale(graph) ** 2
+
+
+def prior_odds(graph: PoseGraph) -> Float[Array, " e"]:
+    """The logarithm of each prior weight over the middle one; 0 for absent edges.
+
+    A weight says how much likelier than usual an edge is right.
+    """
+    present = graph.weight > 0
+    usual = nearest_rank(graph.weight, present, 0.5)
+    return jnp.log(jnp.where(present, graph.weight / jnp.where(usual > 0, usual, 1), 1))
+
+
+def _reach(dim: int) -> float:
+    """R: the turns times the ball (disc) in which the mean length is one."""
+    k, radius = lie.tangent_dim(dim), (dim + 1) / dim
+    turns = 8 * math.pi**2 if dim == 3 else 2 * math.pi
+    ball = 4 / 3 * math.pi * radius**3 if dim == 3 else math.pi * radius**2
+    return (turns * ball) ** (1 / k) / math.sqrt(2 * math.pi)
+
+
+def _neighbour_rank(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+) -> Int[Array, " e"]:
+    """How many measured neighbours of an end are nearer than the other end.
+
+    Of the end that has fewer. Nearness is that of the poses: squared angle (chordal)
+    and squared length over `length_scale`. Edges as near as each other share a rank.
+    """
+    i, j = graph.edges[:, 0], graph.edges[:, 1]
+    gap = product(lie.inverse(T_world_i)[i], T_world_i[j])
+    far = graph.dim - jnp.trace(lie.rotation(gap), axis1=-2, axis2=-1)
+    shift = jnp.sum(lie.translation(gap) ** 2, axis=-1) / length_scale(graph) ** 2
+    far = jnp.where(graph.weight > 0, far + shift, jnp.inf)
+    frame, far = jnp.concatenate([i, j]), jnp.concatenate([far, far])
+    place = jnp.arange(len(frame), dtype=jnp.int32)
+    frame, far, order = jax.lax.sort((frame, far, place), num_keys=2)
+    new_frame = jnp.append(True, frame[1:] != frame[:-1])
+    new = new_frame | jnp.append(True, far[1:] > far[:-1])
+    first = jax.lax.cummax(jnp.where(new_frame, place, 0))
+    rank = jax.lax.cummax(jnp.where(new, place, 0)) - first
+    rank = jnp.zeros_like(rank).at[order].set(rank, unique_indices=True)
+    return jnp.minimum(rank[: len(i)], rank[len(i) :])

@@ -1,0 +1,44 @@
+"""A few steps of averaging what agrees with poses: chains of motions drift."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxreg.averaging.measures import length_scale
+from jaxreg.averaging.steps.iterate import nearby_rotation
+from jaxreg.averaging.steps.kernel_width import gaussian_trust
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.linear.laplacian import laplacian
+from jaxreg.linear.operator import divergence
+
+
+# Kernel widths, in radians and length scales: from what holds on to a start to what
+# sees past the noise of real scans.
+_WIDTHS = (0.25, 0.2, 0.15, 0.12, 0.1)
+
+
+def settled(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+) -> Float[Array, "v D D"]:
+    """The poses after a few steps of averaging the motions that agree with them.
+
+    A chain of motions drifts; what agrees with it shows only then. Dense over frames.
+    """
+    num, scale = graph.num_poses, length_scale(graph)
+
+    def step(T: Array, w: Array) -> tuple[Array, None]:
+        trust = graph.weight * gaussian_trust(graph, T, jnp.stack([w * scale, w]))
+        top = jnp.max(trust)
+        trust = trust / jnp.where(top > 0, top, 1)
+        flow = trust[:, None] * lie.log(graph.residual_motions(T))
+        rhs = divergence(graph.edges, flow, num).at[0].set(0)
+        L = laplacian(graph.edges, trust, num)
+        # Frames that nothing holds stay.
+        ridge = 1e-5 * jnp.max(jnp.diagonal(L)) * jnp.eye(num, dtype=L.dtype)
+        factor = jnp.linalg.cholesky(L + ridge)
+        tangent = jax.scipy.linalg.cho_solve((factor, True), rhs)
+        return nearby_rotation(product(lie.exp(tangent), T)), None
+
+    widths = jnp.asarray(_WIDTHS, T_world_i.dtype)
+    return jax.lax.scan(step, T_world_i, widths)[0]

@@ -1,0 +1,152 @@
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import logsumexp
+
+from jaxreg import Status
+from jaxreg.averaging import MotionAveraging, average, likelihood
+from jaxreg.graph import PoseGraph
+from tests.averaging.graphs import folding_graph, random_graph
+
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
+N, H = 10, 25
+log_evidence = eqx.filter_jit(likelihood.log_evidence)
+explained = eqx.filter_jit(likelihood.explained)
+
+
+def single(edges, T, num: int, **kwargs) -> PoseGraph:
+    return PoseGraph.from_edges(edges, T.astype(np.float32), num, **kwargs)
+
+
+def naive(X, edges, T, weight, dimension) -> float:
+    """Log Lambda, edge by edge in float64."""
+    d, k = X.shape[-1] - 1, 3 * X.shape[-1] - 6
+    length = np.linalg.norm(T[:, :d, d], axis=1)
+    low, high = np.sort(length)[[round(q * (len(T) - 1)) for q in (0.25, 0.75)]]
+    scale = length[(length >= low) & (length <= high)].mean()
+    sq, far = [], {}
+    for e, (i, j) in enumerate(edges.tolist()):
+        P = np.linalg.inv(X[i]) @ X[j]
+        D = (P - T[e]) ** 2
+        sq.append(D[:d, :d].sum() / 2 + D[:d, d].sum() / scale**2)
+        far[e] = d - np.trace(P[:d, :d]) + (P[:d, d] ** 2).sum() / scale**2
+    rank = [
+        min(
+            sum(far[f] < far[e] for f, ends in enumerate(edges.tolist()) if end in ends)
+            for end in edges[e].tolist()
+        )
+        for e in far
+    ]
+    volume = {
+        2: 2 * np.pi * np.pi * 1.5**2,
+        3: 8 * np.pi**2 * 4 / 3 * np.pi * (4 / 3) ** 3,
+    }[d]
+    reach = volume ** (1 / k) / np.sqrt(2 * np.pi)
+    odds = [-4.5, -3, -1.5, 0, 1.5, 3, 4.5]
+    prior = weight / np.sort(weight)[round(0.5 * (len(weight) - 1))]
+    terms = []
+    for s in 0.5 / 2.0 ** np.arange(8):
+        gain = (reach / s) ** dimension * np.exp(-np.array(sq) / (2 * s**2))
+        for t in (4, 8):
+            for near in odds[3:]:
+                for beyond in (x for x in odds if x <= near):
+                    o = np.exp(np.where(np.array(rank) < t, near, beyond)) * prior
+                    each = np.log((1 + o * gain) / (1 + o)).sum()
+                    free = len(np.unique(edges)) - 1
+                    terms.append(each - free * dimension * np.log(reach / s))
+    return float(logsumexp(terms) - np.log(len(terms)))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("outliers", [0.1, 0.5])
+def test_against_a_sum_over_edges_and_shares(d, outliers):
+    X, edges, T, _ = random_graph(N, H, outliers, 0, d=d)
+    weight = np.random.default_rng(0).uniform(0.2, 3, H)
+    graph = single(edges, T, N, weight=weight.astype(np.float32))
+    for poses in (X, random_graph(N, H, 0.0, 1, d=d)[0]):
+        of = jnp.asarray(poses, jnp.float32)
+        expected = naive(poses, edges, T, weight, {2: 3, 3: 6}[d])
+        np.testing.assert_allclose(log_evidence(graph, of), expected, rtol=2e-3)
+        expected = naive(poses, edges, T, weight, 0.8)
+        found = explained(graph, of)
+        np.testing.assert_allclose(found.log_ratio, expected, rtol=2e-3, atol=1e-2)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000), unit=st.sampled_from([1e-3, 1.0, 25.4]))
+def test_numbers_unit_and_a_common_motion_do_not_matter(seed, unit):
+    rng = np.random.default_rng(seed)
+    X, edges, T, _ = random_graph(N, H, 0.4, seed)
+    base = log_evidence(single(edges, T, N), jnp.asarray(X, jnp.float32))
+    name, order = rng.permutation(N), rng.permutation(H)
+    G = random_graph(3, 3, 0.0, seed)[0][1]
+    other = np.zeros_like(X)
+    other[name] = G @ X
+    other, moved = other.copy(), T[order].copy()
+    other[:, :3, 3] *= unit
+    moved[:, :3, 3] *= unit
+    again = single(name[edges[order]], moved, N)
+    found = log_evidence(again, jnp.asarray(other, jnp.float32))
+    np.testing.assert_allclose(found, base, rtol=5e-3, atol=0.05)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_a_tree_has_no_evidence(seed):
+    rng = np.random.default_rng(seed)
+    X = random_graph(N, H, 0.0, seed)[0]
+    to = np.arange(1, N)
+    edges = np.stack([rng.integers(0, to), to], axis=1)
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]]
+    weight = rng.uniform(0.1, 5, N - 1).astype(np.float32)
+    graph = single(edges, T, N, weight=weight)
+    for poses in (X, random_graph(N, H, 0.0, seed + 1)[0]):
+        assert log_evidence(graph, jnp.asarray(poses, jnp.float32)) <= 1e-3
+
+
+def test_absent_edges_count_nothing():
+    X, edges, T, bad = random_graph(N, H, 0.3, 2)
+    true = jnp.asarray(X, jnp.float32)
+    kept = log_evidence(single(edges[~bad], T[~bad], N), true)
+    masked = average(single(edges, T, N, mask=~bad), MotionAveraging()).log_evidence
+    found = average(single(edges[~bad], T[~bad], N), MotionAveraging()).log_evidence
+    np.testing.assert_allclose(masked, found, rtol=1e-4)
+    assert kept > log_evidence(single(edges, T, N), true) > 0
+
+
+def test_the_likeliest_deviation_and_the_odds_are_those_of_right_edges():
+    X, edges, T, bad = random_graph(32, 465, 0.5, 0)
+    found = explained(single(edges, T, 32), jnp.asarray(X, jnp.float32))
+    # 0.5 degrees, and 0.5 % of a size that is about a length scale.
+    assert 0.01 < found.deviation < 0.05
+    np.testing.assert_array_equal(np.asarray(found.log_odds) > 0, ~bad)
+
+
+def test_near_views_tell_the_truth_from_a_larger_group_of_wrong_motions():
+    for seed in range(3):
+        X, folded, edges, T = folding_graph(seed)
+        graph = single(edges, T, len(X))
+        true, wrong = (jnp.asarray(P, jnp.float32) for P in (X, folded))
+        assert log_evidence(graph, wrong) > log_evidence(graph, true)
+        assert explained(graph, true).log_ratio > explained(graph, wrong).log_ratio
+
+
+def test_where_nothing_agrees_the_status_says_so():
+    X, edges, T, _ = random_graph(N, H, 0.0, 3)
+    found = average(single(edges, T, N))
+    assert found.status == Status.CONVERGED
+    assert found.log_evidence > 100
+    wild = random_graph(N, H, 0.0, 4)[2][np.random.default_rng(0).permutation(H)]
+    found = average(single(edges, wild, N))
+    assert found.status == Status.NO_AGREEMENT
+    assert found.log_evidence <= 0
+    assert "agree" in Status.NO_AGREEMENT.advice
+    # A tree has no edge to spare.
+    chain = np.stack([np.arange(N - 1), np.arange(1, N)], axis=1)
+    assert average(single(chain, wild[: N - 1], N)).status == Status.CONVERGED
