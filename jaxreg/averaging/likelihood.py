@@ -106,6 +106,15 @@ def explained(
     return _explained(graph, T_world_i, float(dimension))
 
 
+def least_after_fitting(found: Explained) -> Float[Array, ""]:
+    """What other poses of the same right edges reach, but for a standard deviation.
+
+    The terms r^2 / (2 s^2) of right edges have variance D / 2 each.
+    """
+    right = jnp.sum(jax.nn.sigmoid(found.log_odds))
+    return found.log_ratio - jnp.sqrt(_DIMENSION / 2 * right)
+
+
 def agreed_share(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"]
 ) -> Float[Array, ""]:

@@ -15,7 +15,7 @@ from jaxreg._core.checks import check_counts, check_not_negative, check_parts
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, start
-from jaxreg.averaging.likelihood import explained
+from jaxreg.averaging.likelihood import explained, least_after_fitting
 from jaxreg.averaging.measures import length_scale, num_held
 from jaxreg.averaging.methods.graduated import graduated
 from jaxreg.averaging.methods.motion_averaging import iterate_plain
@@ -105,12 +105,13 @@ class Correntropy(AbstractAverager):
         """From the likeliest width; from half of it where that loses likelihood.
 
         A kernel that is too wide draws poses to a larger group of edges that agree
-        less well.
+        less well; one that is too narrow fits noise. So it loses if it loses more than
+        chance would.
         """
         fixed, T_start = jax.lax.stop_gradient((graph, T_start))
         followed = eqx.Partial(followed_width, length_scale(fixed))
         T = _better_start(fixed, T_start, fixed)
-        least = explained(fixed, T).log_ratio
+        least = least_after_fitting(explained(fixed, T))
         width = first_width(fixed, T)
 
         def narrower(tried: tuple[Array, Array, Iterated]) -> tuple:
