@@ -12,6 +12,7 @@ import argparse
 import os
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -46,7 +47,7 @@ def main() -> None:
         begin, found = time.perf_counter(), list(rows(first))
         for name, figures in found if args.each else []:
             print(f"    {name}: {told(figures)}")
-        mean = {k: np.mean([f[k] for _, f in found]) for k in found[0][1]}
+        mean = {k: float(np.mean([f[k] for _, f in found])) for k in found[0][1]}
         seconds = time.perf_counter() - begin
         print(
             f"{kind}, {len(found)} graphs: {told(mean)} ({seconds:.0f} s)", flush=True
@@ -89,8 +90,8 @@ def _right(scene: Scene, degrees: float, metres: float) -> dict[str, float]:
 
 def _own(found: AveragingSolution) -> dict[str, float]:
     """What a solution says of itself."""
-    evidence = getattr(found, "log_evidence", 0.0)
-    return {"settled": float(found.status == 0), "evidence": float(evidence)}
+    evidence = float(found.log_evidence)
+    return {"settled": float(found.status == 0), "evidence": evidence}
 
 
 def random(outliers: float, num: int, edges: int, first: int) -> Iterator[Row]:
@@ -135,7 +136,7 @@ KINDS = {
     "logs": logs,
     **{
         f"random {num}:{edges}, {outliers} wrong": (
-            lambda first, a=(outliers, num, edges): random(*a, first)
+            partial(random, outliers, num, edges)
         )
         for outliers in (0.3, 0.5)
         for num, edges in SIZES

@@ -4,7 +4,7 @@ from jaxreg.averaging.average import average as average
 from jaxreg.averaging.base import AbstractAverager as AbstractAverager
 from jaxreg.averaging.base import AveragingSolution as AveragingSolution
 from jaxreg.averaging.base import solution as solution
-from jaxreg.averaging.base import start as start
+from jaxreg.averaging.base import starting_poses as starting_poses
 from jaxreg.averaging.covariance import pose_covariances as pose_covariances
 from jaxreg.averaging.methods.correntropy import Correntropy as Correntropy
 from jaxreg.averaging.methods.low_rank_sparse import LowRankSparse as LowRankSparse

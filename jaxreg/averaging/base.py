@@ -124,7 +124,7 @@ def solution(
     )
 
 
-def start(
+def starting_poses(
     initialiser: AbstractAverager,
     graph: PoseGraph,
     init: Float[Array, "v D D"] | None,

@@ -118,10 +118,17 @@ def least_after_fitting(found: Explained) -> Float[Array, ""]:
 def agreed_share(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"]
 ) -> Float[Array, ""]:
-    """The share of the edges that are likelier right than wrong; 0 without edges."""
-    right = explained(graph, T_world_i).log_odds > 0
-    count = jnp.maximum(jnp.sum(graph.weight > 0), 1)
-    return jnp.sum(right) / count.astype(graph.weight.dtype)
+    """The share of the edges to spare that are likelier right than wrong.
+
+    A tree agrees with its own edges, wherever it leads: only those beyond count, but
+    where there are none. 0 without edges.
+    """
+    present = jnp.sum(graph.weight > 0)
+    right = jnp.sum(explained(graph, T_world_i).log_odds > 0)
+    tree = num_held(graph).astype(right.dtype) - 1
+    tree = jnp.where(present > tree, tree, 0)
+    count = jnp.maximum(present - tree, 1).astype(graph.weight.dtype)
+    return (right - tree) / count
 
 
 def _explained(graph: PoseGraph, T_world_i: Array, dimension: float) -> Explained:

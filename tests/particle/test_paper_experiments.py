@@ -34,6 +34,7 @@ from jaxreg.particle import (
     AbstractDynamics,
     AbstractSearch,
     ConstantVelocity,
+    EnsembleSpread,
     GaussianPrior,
     NoDynamics,
     StochasticDynamics,
@@ -57,7 +58,7 @@ class _AnyOf(AbstractDynamics):
         return False
 
     def __call__(self, key, particles, time):
-        diffusion = StochasticDynamics(jnp.float32(1), "ensemble")
+        diffusion = StochasticDynamics(jnp.float32(1), EnsembleSpread())
         three = (NoDynamics(), ConstantVelocity(), diffusion)
         return jnp.stack([one(key, particles, time) for one in three])[self.which]
 

@@ -14,7 +14,7 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_parts
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, start
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.likelihood import explained, least_after_fitting
 from jaxreg.averaging.measures import length_scale, num_held
 from jaxreg.averaging.methods.graduated import graduated
@@ -86,7 +86,7 @@ class Correntropy(AbstractAverager):
         """Averages a prepared graph."""
         if graph.num_poses > DENSE_LIMIT:
             return self._large(graph, init, key)
-        T_start = start(self.initialiser, graph, init, key)
+        T_start = starting_poses(self.initialiser, graph, init, key)
         return self._small(graph, T_start)
 
     @eqx.filter_jit
@@ -146,7 +146,7 @@ class Correntropy(AbstractAverager):
     ) -> Iterated:
         near = without_lone_closures(jax.lax.stop_gradient(graph))
         if init is None:
-            T_start = start(self.initialiser, near, None, key)
+            T_start = starting_poses(self.initialiser, near, None, key)
             starts = [_better_start(graph, T_start, near), along_frames(graph)]
         else:
             # A start of the caller's may be far off: plain steps that leave out what

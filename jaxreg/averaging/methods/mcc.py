@@ -18,7 +18,7 @@ from jaxreg._core.checks import (
     check_positive,
 )
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, start
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.measures import frobenius, length_scale, weighted_mean
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus
 from jaxreg.averaging.steps.iterate import (
@@ -75,7 +75,9 @@ class MCC(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Averages a prepared graph."""
-        return self._from_start(graph, start(self.initialiser, graph, init, key))
+        return self._from_start(
+            graph, starting_poses(self.initialiser, graph, init, key)
+        )
 
     @eqx.filter_jit
     def _from_start(

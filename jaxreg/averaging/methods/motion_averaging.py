@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_parts
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, start
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.methods.shortest_paths import ShortestPaths
 from jaxreg.averaging.steps.iterate import (
     STEP_TOLERANCE,
@@ -61,7 +61,7 @@ class MotionAveraging(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Averages a prepared graph."""
-        T_start = start(self.initialiser, graph, init, key)
+        T_start = starting_poses(self.initialiser, graph, init, key)
         rows = EqualRows()
         return _least_squares(graph, T_start, rows, self.max_steps, self.tolerance)
 
@@ -99,7 +99,7 @@ class WeightedMotionAveraging(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Averages a prepared graph."""
-        T_start = start(self.initialiser, graph, init, key)
+        T_start = starting_poses(self.initialiser, graph, init, key)
         return _least_squares(graph, T_start, self.rows, self.max_steps, self.tolerance)
 
 

@@ -16,7 +16,12 @@ from jaxreg._core.checks import (
     check_positive,
 )
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution, start
+from jaxreg.averaging.base import (
+    AbstractAverager,
+    AveragingSolution,
+    solution,
+    starting_poses,
+)
 from jaxreg.averaging.methods.motion_averaging import MotionAveraging
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError, LogError
 from jaxreg.averaging.steps.implicit import differentiable
@@ -85,7 +90,9 @@ class PoseGraphLM(AbstractAverager):
     ) -> AveragingSolution:
         """Minimises the objective of a prepared graph."""
         fixed, held = jax.lax.stop_gradient((graph, self))
-        T_start = jax.lax.stop_gradient(start(self.initialiser, fixed, init, key))
+        T_start = jax.lax.stop_gradient(
+            starting_poses(self.initialiser, fixed, init, key)
+        )
         problem = held._problem(fixed)
         end = minimise(problem, T_start, self.max_steps, held.tolerance)
         T = self._with_gradients(graph, problem, end.T)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg.averaging.likelihood import explained
 from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.steps.iterate import nearby_rotation
 from jaxreg.averaging.steps.kernel_width import gaussian_trust
@@ -14,7 +15,7 @@ from jaxreg.linear.operator import divergence
 
 
 # Kernel widths, in radians and length scales: from what holds on to a start to what
-# sees past the noise of real scans.
+# sees past the noise of real scans; but never less than twice the likeliest deviation.
 _WIDTHS = (0.25, 0.2, 0.15, 0.12, 0.1)
 
 
@@ -28,6 +29,7 @@ def settled(
     num, scale = graph.num_poses, length_scale(graph)
 
     def step(T: Array, w: Array) -> tuple[Array, None]:
+        w = jnp.maximum(w, 2 * explained(graph, T).deviation)
         trust = graph.weight * gaussian_trust(graph, T, jnp.stack([w * scale, w]))
         top = jnp.max(trust)
         trust = trust / jnp.where(top > 0, top, 1)
