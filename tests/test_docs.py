@@ -86,7 +86,7 @@ def test_the_code_of_extending_keeps_its_promises(monkeypatch):
 
 def test_tables_name_every_status_and_contract():
     text = (ROOT / "docs/pages/words.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| ([A-Z_]+) \| (\d) \| (.*?) \|", text, re.MULTILINE)
+    rows = re.findall(r"^\| ([A-Z_]+) \| (\d+) \| (.*?) \|", text, re.MULTILINE)
     table = {name: int(value) for name, value, meaning in rows if meaning}
     assert table == {status.name: int(status) for status in jr.Status}
     for status, thresholds in THRESHOLDS.items():
