@@ -115,6 +115,31 @@ RESAMPLERS = [
     particle.Stratified(),
     particle.Systematic(0.3),
 ]
+#: Steps, and the residual that they are tried with.
+STEPS: list[tuple[jr.AbstractStep, jr.AbstractResidual]] = [
+    (jr.ClosedForm(), jr.PointToPoint()),
+    (jr.GaussNewton(), jr.Symmetric()),
+    (jr.GradientDescent(), jr.PointToPlane()),
+    (jr.LevenbergMarquardt(), jr.PlaneToPlane()),
+]
+DYNAMICS = [
+    particle.NoDynamics(),
+    particle.ConstantVelocity(),
+    particle.StochasticDynamics(),
+    particle.StochasticDynamics(0.5, particle.EnsembleSpread()),
+    particle.StochasticDynamics(spread=particle.PathSpread()),
+]
+ENERGIES = [
+    particle.AbsoluteEnergy(),
+    particle.BoundedEnergy(),
+    particle.SquaredEnergy(),
+]
+#: Priors, and how many poses they are asked for.
+PRIORS = [
+    (particle.GaussianPrior(), 8),
+    (particle.GivenParticles(problems.poses(3)), NUM_POSES),
+    (particle.UniformPrior(), 8),
+]
 #: Public functions: the three verbs, and those that need no method.
 FUNCTIONS = {
     "register",

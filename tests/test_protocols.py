@@ -10,13 +10,17 @@ import pytest
 from helpers import switched_on
 from protocols import (
     AVERAGERS,
+    DYNAMICS,
+    ENERGIES,
     FUNCTIONS,
     INDEXES,
     KERNELS,
     KEY,
+    PRIORS,
     REGISTRARS,
     RESAMPLERS,
     RESIDUALS,
+    STEPS,
     graph,
     measured,
     pair,
@@ -26,11 +30,15 @@ from protocols import (
 import jaxreg as jr
 from jaxreg.testing import (
     check_averager,
+    check_dynamics,
+    check_energy,
     check_index,
     check_kernel,
+    check_prior,
     check_registrar,
     check_resampler,
     check_residual,
+    check_step,
 )
 from jaxreg.testing.promises import (
     promise_dtypes,
@@ -70,6 +78,10 @@ def test_every_public_method_is_in_the_table():
     assert _concrete(jr.AbstractResidual) == _types(RESIDUALS)
     assert _concrete(jr.AbstractKernel) == _types(KERNELS)
     assert _concrete(jr.AbstractResampler) == _types(RESAMPLERS)
+    assert _concrete(jr.AbstractStep) == _types(step for step, _ in STEPS)
+    assert _concrete(jr.AbstractDynamics) == _types(DYNAMICS)
+    assert _concrete(jr.AbstractEnergy) == _types(ENERGIES)
+    assert _concrete(jr.AbstractPrior) == _types(prior for prior, _ in PRIORS)
     public = {name: x for name, x in vars(jr).items() if not name.startswith("_")}
     functions = {
         name for name, x in public.items() if callable(x) and not inspect.isclass(x)
@@ -111,6 +123,27 @@ def test_kernels(kernel):
 @pytest.mark.parametrize("resampler", RESAMPLERS, ids=lambda r: type(r).__name__)
 def test_resamplers(resampler):
     check_resampler(resampler)
+
+
+@pytest.mark.parametrize(("step", "residual"), STEPS, ids=repr)
+def test_steps(step, residual):
+    check_step(step, residual)
+
+
+@pytest.mark.parametrize("dynamics", DYNAMICS, ids=repr)
+def test_dynamics(dynamics):
+    with jax.debug_nans(False):  # rows that are not in use hold them
+        check_dynamics(dynamics)
+
+
+@pytest.mark.parametrize("energy", ENERGIES, ids=repr)
+def test_energies(energy):
+    check_energy(energy)
+
+
+@pytest.mark.parametrize(("prior", "num"), PRIORS, ids=repr)
+def test_priors(prior, num):
+    check_prior(prior, num=num)
 
 
 def test_reconstruction_in_any_transformation():

@@ -3,12 +3,19 @@
 from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import AbstractAverager, AveragingSolution, average
 from jaxreg.graph import PoseGraph
+from jaxreg.testing.methods import (
+    UNIT,
+    Answer,
+    Change,
+    Problem,
+    promise_method,
+    promise_unit,
+)
 from jaxreg.testing.problems import (
     EDGES,
     NUM_POSES,
@@ -18,26 +25,13 @@ from jaxreg.testing.problems import (
     skew,
 )
 from jaxreg.testing.promises import (
-    Answer,
-    Change,
-    Problem,
-    changed,
     promise,
-    promise_dtypes,
     promise_equal,
     promise_known_status,
-    promise_no_slopes,
     promise_rigid,
-    promise_round_trips,
-    promise_same,
-    promise_slopes,
-    promise_traced_numbers,
-    run_side_by_side,
 )
 
 
-# A power of two: only the unit changes, nothing is rounded.
-_UNIT = 1024.0
 _NOISE = 0.035
 
 
@@ -74,8 +68,6 @@ def check_averager(
     Raises:
         AssertionError: naming the promise that is broken.
     """
-    promise_traced_numbers(method)
-    name = type(method).__name__
 
     def solve(
         T_i_j: jax.Array, weight: jax.Array, mask: jax.Array
@@ -84,27 +76,15 @@ def check_averager(
         solution = average(graph, method, key=jax.random.key(0))
         return solution.T_world_i, solution
 
-    with jax.enable_x64(True):
-        changes = _changes(d, gradients)
-        problems = _problems(d) | changed(_problem(d), changes)
-        answers = run_side_by_side(solve, problems, gradients is not None)
-        for which in ("plain", "other"):
-            alone = solve(*map(jax.device_put, problems[which]))[1]
-            promise_dtypes(alone, float, name)
-            promise_same(name, AveragingSolution, answers[which].solution, alone)
-        _promise_poses(name, answers, d)
-        _promise_statuses(name, answers)
-        _promise_equivariance(name, answers, d, turns, lengths)
-        if changes:
-            promise_slopes(name, answers, changes)
-        elif gradients == "zero":
-            promise_no_slopes(name, answers)
-        promise_round_trips(method, alone)
-        T, weight, mask = _problem(d)
-        single = T.astype(np.float32), weight.astype(np.float32), mask
-        with jax.check_tracer_leaks():
-            out = jax.eval_shape(solve, *map(jnp.asarray, single))
-        promise_dtypes(out, np.float32, name)
+    name = type(method).__name__
+    answers, alone = promise_method(
+        *(method, AveragingSolution, solve, _problems(d)),
+        gradients=gradients,
+        changes=_changes(d, gradients),
+    )
+    _promise_poses(name, answers, d)
+    _promise_statuses(name, answers)
+    _promise_equivariance(name, answers, d, turns, lengths)
     return alone
 
 
@@ -123,7 +103,7 @@ def _problems(d: int) -> dict[str, Problem]:
 
     apart = np.any(EDGES == NUM_POSES - 1, axis=1)
     turns, unit = _turns(d), T.copy()
-    unit[:, :d, d] *= _UNIT
+    unit[:, :d, d] *= UNIT
     i, j = EDGES.T
     turned = np.linalg.inv(turns[i]) @ T @ turns[j]
     return {
@@ -209,11 +189,7 @@ def _promise_equivariance(
 ) -> None:
     T = answers["plain"].solution.T_world_i
     if not lengths:
-        scaled = answers["unit"].solution.T_world_i.copy()
-        scaled[:, :d, d] /= _UNIT
-        promise_equal(
-            scaled, T, f"{name}: another unit of length changes the answer", atol=1e-6
-        )
+        promise_unit(name, answers["unit"].solution.T_world_i, T)
     if turns:
         R = _turns(d)
         promise_equal(

@@ -1,8 +1,7 @@
-"""What all checks share: sentences, comparisons, problems side by side, slopes."""
+"""What all checks share: promises in sentences, and comparisons."""
 
 import dataclasses
 import pickle
-from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,14 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.status import Status
-
-
-#: Half of the difference of two arguments of a central difference.
-STEP = 2e-6
-
-Problem = tuple[np.ndarray, ...]
-#: A change of the first two arrays of a problem.
-Change = tuple[np.ndarray, np.ndarray]
 
 
 def promise(kept: Any, sentence: str) -> None:
@@ -56,11 +47,13 @@ def promise_dtypes(tree: Any, dtype: Any, name: str) -> None:
             )
 
 
-def promise_rigid(name: str, problem: str, T: np.ndarray) -> None:
+def promise_rigid(
+    name: str, problem: str, T: np.ndarray, *, atol: float = 1e-9
+) -> None:
     """Requires homogeneous matrices `(..., d+1, d+1)` of rigid motions."""
     d = T.shape[-1] - 1
     R = T[..., :d, :d]
-    rigid = np.allclose(R @ R.swapaxes(-1, -2), np.eye(d), atol=1e-9)
+    rigid = np.allclose(R @ R.swapaxes(-1, -2), np.eye(d), atol=atol)
     rigid = rigid and np.all(np.linalg.det(R) > 0)
     rigid = rigid and np.all(T[..., d, :] == np.eye(d + 1)[d])
     promise(rigid, f"{name}: a pose of the problem '{problem}' is not rigid.")
@@ -121,94 +114,3 @@ def promise_traced_numbers(part: eqx.Module) -> None:
             f"{type(part).__name__}.{field.name} is a Python float, so that another "
             "value compiles again; make it an array with a converter.",
         )
-
-
-@dataclasses.dataclass(frozen=True)
-class Answer:
-    """Of one problem: a weighted sum of the pose, the solution, the slopes of the sum.
-
-    The slopes are by the first two arrays of the problem, or None.
-    """
-
-    value: float
-    solution: Any
-    slopes: tuple[np.ndarray, np.ndarray] | None
-
-
-def run_side_by_side(
-    solve: Callable[..., tuple[jax.Array, Any]],
-    problems: Mapping[str, Problem],
-    differentiate: bool,
-) -> dict[str, Answer]:
-    """The answers to all problems by one program, `jit(vmap(solve))`.
-
-    Args:
-        solve: gives the poses and the whole solution.
-        problems: by name, arrays of the same shapes.
-        differentiate: by the first two arrays.
-    """
-
-    def answer(*arrays: jax.Array) -> tuple[jax.Array, Any]:
-        out, solution = solve(*arrays)
-        weight = jnp.cos(jnp.arange(out.size, dtype=out.dtype)).reshape(out.shape)
-        return jnp.sum(weight * out), solution
-
-    one = jax.value_and_grad(answer, (0, 1), has_aux=True) if differentiate else answer
-    columns = [
-        jax.device_put(np.stack(x)) for x in zip(*problems.values(), strict=True)
-    ]
-    out = jax.device_get(jax.jit(jax.vmap(one))(*columns))
-    (value, solutions), slopes = out if differentiate else (out, None)
-    return {
-        name: Answer(
-            float(value[lane]),
-            jax.tree.map(lambda x, lane=lane: x[lane], solutions),
-            None if slopes is None else tuple(x[lane] for x in slopes),
-        )
-        for lane, name in enumerate(problems)
-    }
-
-
-def changed(problem: Problem, changes: Sequence[Change]) -> dict[str, Problem]:
-    """The problem a little to both sides along each change."""
-    first, second, *others = problem
-    return {
-        f"change {number} {sign:+d}": (
-            first + sign * STEP * a,
-            second + sign * STEP * b,
-            *others,
-        )
-        for number, (a, b) in enumerate(changes)
-        for sign in (1, -1)
-    }
-
-
-def promise_slopes(
-    name: str, answers: Mapping[str, Answer], changes: Sequence[Change]
-) -> None:
-    """Requires the gradient of "plain" to be that of central differences."""
-    slopes = answers["plain"].slopes
-    assert slopes is not None
-    numeric, exact = [], []
-    for number, change in enumerate(changes):
-        ends = [answers[f"change {number} {sign:+d}"].value for sign in (1, -1)]
-        numeric.append((ends[0] - ends[1]) / (2 * STEP))
-        parts = zip(slopes, change, strict=True)
-        exact.append(sum(float(np.sum(g * c)) for g, c in parts))
-    largest = float(np.max(np.abs(numeric)))
-    promise(largest > 1e-2, f"{name}: its answer does not follow the data.")
-    promise_equal(
-        np.array(exact),
-        np.array(numeric),
-        f"{name}: gradients {exact} are not the differences {numeric}",
-        rtol=1e-5,
-        atol=1e-5 * largest,
-    )
-
-
-def promise_no_slopes(name: str, answers: Mapping[str, Answer]) -> None:
-    """Requires a gradient of zero."""
-    slopes = answers["plain"].slopes
-    assert slopes is not None
-    zero = not any(np.any(x) for x in slopes)
-    promise(zero, f"{name}: its gradient is not zero, though it was said to be.")

@@ -5,11 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxreg.cloud import PointCloud
 from jaxreg.local import turn_and_shift
-from jaxreg.matching import AbstractResidual, Match, Problem, match, moved
-from jaxreg.neighbours import BruteForce
-from jaxreg.testing.problems import NUM_POINTS, motion, move, surface
+from jaxreg.matching import AbstractResidual, Match, moved
+from jaxreg.testing.matches import matched, noisy_match, random_normals
+from jaxreg.testing.problems import NUM_POINTS, motion, surface
 from jaxreg.testing.promises import (
     promise,
     promise_dtypes,
@@ -41,7 +40,7 @@ def check_residual(residual: AbstractResidual) -> None:
             _promise_zero(name, residual, d)
             _promise_descent(name, residual, d)
             for dtype in (np.float32, np.float64):
-                found = jax.eval_shape(lambda t=dtype, d=d: _noisy(d, t)[0])
+                found = jax.eval_shape(lambda t=dtype, d=d: noisy_match(d, t)[0])
                 weight = jax.ShapeDtypeStruct((NUM_POINTS,), dtype)
                 out = eqx.filter_eval_shape(_evaluate, residual, found, weight)
                 promise_dtypes(out, dtype, name)
@@ -81,47 +80,14 @@ def _energies(
     return jax.vmap(one)(tangents)
 
 
-def _matched(
-    source: np.ndarray, target: np.ndarray, normals: np.ndarray, T: np.ndarray
-) -> Match:
-    """Point i of the source with point i of the target; normals are of both."""
-    dtype, everyone = source.dtype, jnp.ones(len(source), bool)
-    here, there = (
-        PointCloud(jnp.asarray(x), jnp.asarray(n.astype(dtype)), everyone)
-        for x, n in zip((source, target), normals, strict=True)
-    )
-    problem = Problem.of(here, there, BruteForce.build(there.points, everyone))
-    rows = jnp.arange(len(source), dtype=jnp.int32)
-    return match(problem, jnp.asarray(T.astype(dtype)), rows)
-
-
-def _normals(d: int, seed: int = 0) -> np.ndarray:
-    """Of both clouds, `(2, n, d)`, random."""
-    normals = np.random.default_rng(seed).standard_normal((2, NUM_POINTS, d))
-    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-
-
 def _weight(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.1, 1, NUM_POINTS)
 
 
-def _noisy(
-    d: int, dtype: type = np.float64, turn: np.ndarray | None = None
-) -> tuple[Match, np.ndarray]:
-    """A match of which nothing vanishes, and its pose; both clouds turned likewise."""
-    T, G = motion(d, 0.1, 0.05, 2), np.eye(d + 1) if turn is None else turn
-    source = surface(NUM_POINTS, d)
-    noise = 0.1 * np.random.default_rng(3).standard_normal(source.shape)
-    target = move(motion(d, 0.2, 0.1, 1), source) + noise
-    source, target = (move(G, x).astype(dtype) for x in (source, target))
-    T = G @ T @ np.linalg.inv(G)
-    return _matched(source, target, _normals(d) @ G[:d, :d].T, T), T
-
-
 def _promise_zero(name: str, residual: AbstractResidual, d: int) -> None:
-    source, normals, k = surface(NUM_POINTS, d), _normals(d)[:1], 3 * d - 3
+    source, normals, k = surface(NUM_POINTS, d), random_normals(d)[:1], 3 * d - 3
     still = np.eye(d + 1)
-    found = _matched(source, source, np.concatenate([normals, normals]), still)
+    found = matched(source, source, np.concatenate([normals, normals]), still)
     weight = jnp.asarray(_weight())
     energy, H, b, descents = map(np.asarray, _evaluate(residual, found, weight))
     what = "at the identity on equal clouds"
@@ -148,7 +114,7 @@ def _promise_zero(name: str, residual: AbstractResidual, d: int) -> None:
 
 
 def _promise_descent(name: str, residual: AbstractResidual, d: int) -> None:
-    (found, T), weight = _noisy(d), jnp.asarray(_weight())
+    (found, T), weight = noisy_match(d), jnp.asarray(_weight())
     energy, H, b, descents = _evaluate(residual, found, weight)
     promise(float(energy) >= 0, f"{name}: a negative energy.")
     promise_equal(descents @ weight, b, f"{name}: descents do not add up to b")
@@ -165,7 +131,7 @@ def _promise_descent(name: str, residual: AbstractResidual, d: int) -> None:
     )
     eager = residual.energy(found, weight)
     promise_equal(eager, energy, f"{name}: compiling changes the energy", rtol=1e-9)
-    turned, _ = _noisy(d, turn=motion(d, 0.9, 0.0, 5))
+    turned, _ = noisy_match(d, turn=motion(d, 0.9, 0.0, 5))
     promise_equal(
         _evaluate(residual, turned, weight)[0],
         energy,

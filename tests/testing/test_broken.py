@@ -8,15 +8,21 @@ import pytest
 import jaxreg as jr
 from jaxreg import robust
 from jaxreg.averaging.base import solution
+from jaxreg.local import turn_and_shift
 from jaxreg.neighbours import BruteForce
+from jaxreg.particle import UniformPrior
 from jaxreg.robust import three_lower_thirds
 from jaxreg.testing import (
     check_averager,
+    check_dynamics,
+    check_energy,
     check_index,
     check_kernel,
+    check_prior,
     check_registrar,
     check_resampler,
     check_residual,
+    check_step,
 )
 
 
@@ -174,6 +180,154 @@ class Resampler(jr.AbstractResampler):
 def test_resamplers():
     with pytest.raises(AssertionError, match="copies are not as many as their share"):
         check_resampler(Resampler())
+
+
+class Step(jr.AbstractStep):
+    """Gauss-Newton's, or what `twist` makes of it."""
+
+    twist: str = eqx.field(default="", static=True)
+
+    def __call__(self, T_target_source, match, weight, residual):
+        T = jr.GaussNewton()(T_target_source, match, weight, residual)
+        d = len(T) - 1
+        if self.twist == "back":
+            return T_target_source @ jnp.linalg.inv(T) @ T_target_source
+        if self.twist == "drifts":
+            return T.at[0, d].add(0.01)
+        if self.twist == "stretches":
+            return T.at[:d, :d].multiply(1.01)
+        if self.twist == "all points":
+            ones = jnp.ones_like(weight) * (jnp.max(weight) > 0)
+            return jr.GaussNewton()(T_target_source, match, ones, residual)
+        if self.twist == "in lengths":
+            shift = (T - T_target_source)[:d, d]
+            return T.at[:d, d].add(-shift * (1 - 1 / (1 + jnp.sum(shift**2))))
+        if self.twist == "along one axis":
+            return T.at[1, d].set(T_target_source[1, d])
+        return T
+
+
+@pytest.mark.parametrize(
+    ("twist", "sentence"),
+    [
+        ("back", "the energy does not fall"),
+        ("drifts", "weights of zero move the pose"),
+        ("stretches", "a pose of the problem 'plain' is not rigid"),
+        ("all points", "a point of weight zero counts"),
+        ("in lengths", "another unit of length changes the answer"),
+        ("along one axis", "it does not turn with the clouds"),
+    ],
+)
+def test_steps(twist, sentence):
+    check_step(Step())
+    with pytest.raises(AssertionError, match=f"Step in 2D: {sentence}"):
+        check_step(Step(twist))
+
+
+class Dynamics(jr.AbstractDynamics):
+    """Half of the motion error again, or what `twist` makes of it."""
+
+    twist: str = eqx.field(default="", static=True)
+    needs_path = False
+
+    def __call__(self, key, particles, time):
+        T, error = particles.T_target_source, particles.motion_error
+        if self.twist == "jitters":
+            error = error + 0.1 * jax.random.normal(key, error.shape)
+        if self.twist == "mean":
+            error = jnp.broadcast_to(jnp.mean(error, axis=0), error.shape)
+        if self.twist == "promotes":
+            T = T.astype(float)
+        moved = jax.vmap(turn_and_shift)(T, error / 2)
+        return 2 * moved if self.twist == "stretches" else moved
+
+
+@pytest.mark.parametrize(
+    ("twist", "sentence"),
+    [
+        ("jitters", "particles without motion errors move"),
+        ("mean", "a row without weight counts"),
+        ("promotes", "data of float32 give float64"),
+        ("stretches", "a pose of the problem 'plain' is not rigid"),
+    ],
+)
+def test_dynamics(twist, sentence):
+    check_dynamics(Dynamics())
+    with pytest.raises(AssertionError, match=f"Dynamics in 2D: {sentence}"):
+        check_dynamics(Dynamics(twist))
+
+
+class Energy(jr.AbstractEnergy):
+    """The mean squared residual, or what `twist` makes of it."""
+
+    twist: str = eqx.field(default="", static=True)
+    resolution = 0.0
+
+    def __call__(self, found, width):
+        sq = jnp.where(found.mask, found.sq_residual, 0)
+        mean = jnp.sum(sq) / jnp.maximum(jnp.sum(found.mask), 1)
+        if self.twist == "sum":
+            return jnp.sum(sq)
+        if self.twist == "everyone":
+            return jnp.mean(found.sq_residual)
+        if self.twist == "likelihood":
+            return -mean
+        if self.twist == "of nobody":
+            return jnp.sum(sq) / jnp.sum(found.mask)
+        if self.twist == "height":
+            return mean + found.residual[0, 0] ** 2
+        return mean
+
+
+@pytest.mark.parametrize(
+    ("twist", "sentence"),
+    [
+        ("sum", "it is no mean"),
+        ("everyone", "masked points count"),
+        ("likelihood", r"it is not less at the true pose than 0\.05 rad from it"),
+        ("of nobody", "it is not finite"),
+        ("height", "it changes when both clouds turn"),
+    ],
+)
+def test_energies(twist, sentence):
+    check_energy(Energy())
+    with pytest.raises(AssertionError, match=f"Energy in 2D: {sentence}"):
+        check_energy(Energy(twist))
+
+
+class Prior(jr.AbstractPrior):
+    """The guess alone, or what `twist` makes of it."""
+
+    twist: str = eqx.field(default="", static=True)
+
+    def draw(self, key, num, d, init, dtype):
+        T = jnp.eye(d + 1) if init is None else init
+        num = num - 1 if self.twist == "one less" else num
+        T = jnp.tile(T, (num, 1, 1))
+        if self.twist == "reflects":
+            T = T.at[:, 0].multiply(-1)
+        return T if self.twist == "promotes" else T.astype(dtype)
+
+    def in_frames(self, frames):
+        if self.twist == "forgets":
+            return UniformPrior()
+        return None if self.twist == "no frames" else self
+
+
+@pytest.mark.parametrize(
+    ("twist", "sentence"),
+    [
+        ("one less", r"wanted poses \(64, 4, 4\), found \(63, 4, 4\)"),
+        ("reflects", "with a guess' is not rigid"),
+        ("promotes", "data of float32 give float64"),
+        ("forgets", "frames of the input change its poses"),
+        ("no frames", "in_frames gives no prior"),
+    ],
+)
+def test_priors(twist, sentence):
+    check_prior(Prior())
+    with pytest.raises(AssertionError, match=f"Prior.*{sentence}"):
+        check_prior(Prior(twist))
 
 
 class Nothing(jr.AbstractRegistrar):

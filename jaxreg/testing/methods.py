@@ -1,0 +1,169 @@
+"""What methods of `register` and of `average` promise alike."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxreg.testing.promises import (
+    promise,
+    promise_dtypes,
+    promise_equal,
+    promise_round_trips,
+    promise_same,
+    promise_traced_numbers,
+)
+
+
+# A power of two: only the unit changes, nothing is rounded.
+UNIT = 1024.0
+# Half of the difference of two arguments of a central difference.
+_STEP = 2e-6
+
+Problem = tuple[np.ndarray, ...]
+#: A change of the first two arrays of a problem.
+Change = tuple[np.ndarray, np.ndarray]
+#: Gives the poses and the whole solution of a problem.
+Solve = Callable[..., tuple[jax.Array, Any]]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Of one problem: a weighted sum of the pose, the solution, the slopes of the sum.
+
+    The slopes are by the first two arrays of the problem, or None.
+    """
+
+    value: float
+    solution: Any
+    slopes: tuple[np.ndarray, np.ndarray] | None
+
+
+def promise_method(
+    method: eqx.Module,
+    kind: type,
+    solve: Solve,
+    problems: Mapping[str, Problem],
+    *,
+    gradients: str | None,
+    changes: Sequence[Change] = (),
+) -> tuple[dict[str, Answer], Any]:
+    """Requires of a method what does not depend on what it solves.
+
+    Numbers that are traced; the same answers alone and by one compiled program; dtypes
+    of the data; solutions that can be stored; gradients as said.
+
+    Args:
+        method: whose name is told.
+        kind: class of its solutions.
+        solve: the poses and the whole solution of a problem.
+        problems: by name, arrays of the same shapes; among them "plain" and "other".
+        gradients: by the first two arrays: "zero" where they are cut, None where
+            nothing is promised, else those of central differences along `changes`.
+        changes: of "plain".
+
+    Returns:
+        The answers by the name of their problem, and the solution of "plain" alone.
+    """
+    promise_traced_numbers(method)
+    name, plain = type(method).__name__, problems["plain"]
+    with jax.enable_x64(True):
+        together = {**problems, **_changed(plain, changes)}
+        answers = _side_by_side(solve, together, gradients is not None)
+        for which in ("other", "plain"):
+            alone = solve(*map(jax.device_put, problems[which]))[1]
+            promise_dtypes(alone, float, name)
+            promise_same(name, kind, answers[which].solution, alone)
+        promise_round_trips(method, alone)
+        single = [x.astype(np.float32) if x.dtype != bool else x for x in plain]
+        with jax.check_tracer_leaks():
+            out = jax.eval_shape(solve, *map(jnp.asarray, single))
+        promise_dtypes(out, np.float32, name)
+    if changes:
+        _promise_slopes(name, answers, changes)
+    elif gradients == "zero":
+        _promise_no_slopes(name, answers)
+    return answers, alone
+
+
+def promise_unit(name: str, scaled: np.ndarray, T: np.ndarray) -> None:
+    """Requires poses in another unit of length to be `T` in that unit."""
+    back = scaled.copy()
+    back[..., :-1, -1] /= UNIT
+    what = f"{name}: another unit of length changes the answer"
+    promise_equal(back, T, what, atol=1e-6)
+
+
+def _side_by_side(
+    solve: Solve, problems: Mapping[str, Problem], differentiate: bool
+) -> dict[str, Answer]:
+    """The answers to all problems by one program, `jit(vmap(solve))`."""
+
+    def answer(*arrays: jax.Array) -> tuple[jax.Array, Any]:
+        out, solution = solve(*arrays)
+        weight = jnp.cos(jnp.arange(out.size, dtype=out.dtype)).reshape(out.shape)
+        return jnp.sum(weight * out), solution
+
+    one = jax.value_and_grad(answer, (0, 1), has_aux=True) if differentiate else answer
+    columns = [
+        jax.device_put(np.stack(x)) for x in zip(*problems.values(), strict=True)
+    ]
+    out = jax.device_get(jax.jit(jax.vmap(one))(*columns))
+    (value, solutions), slopes = out if differentiate else (out, None)
+    return {
+        name: Answer(
+            float(value[lane]),
+            jax.tree.map(lambda x, lane=lane: x[lane], solutions),
+            None if slopes is None else tuple(x[lane] for x in slopes),
+        )
+        for lane, name in enumerate(problems)
+    }
+
+
+def _changed(problem: Problem, changes: Sequence[Change]) -> dict[str, Problem]:
+    """The problem a little to both sides along each change."""
+    first, second, *others = problem
+    return {
+        f"change {number} {sign:+d}": (
+            first + sign * _STEP * a,
+            second + sign * _STEP * b,
+            *others,
+        )
+        for number, (a, b) in enumerate(changes)
+        for sign in (1, -1)
+    }
+
+
+def _promise_slopes(
+    name: str, answers: Mapping[str, Answer], changes: Sequence[Change]
+) -> None:
+    """Requires the gradient of "plain" to be that of central differences."""
+    slopes = answers["plain"].slopes
+    assert slopes is not None
+    numeric, exact = [], []
+    for number, change in enumerate(changes):
+        ends = [answers[f"change {number} {sign:+d}"].value for sign in (1, -1)]
+        numeric.append((ends[0] - ends[1]) / (2 * _STEP))
+        parts = zip(slopes, change, strict=True)
+        exact.append(sum(float(np.sum(g * c)) for g, c in parts))
+    largest = float(np.max(np.abs(numeric)))
+    promise(largest > 1e-2, f"{name}: its answer does not follow the data.")
+    promise_equal(
+        np.array(exact),
+        np.array(numeric),
+        f"{name}: gradients {exact} are not the differences {numeric}",
+        rtol=1e-5,
+        atol=1e-5 * largest,
+    )
+
+
+def _promise_no_slopes(name: str, answers: Mapping[str, Answer]) -> None:
+    """Requires a gradient of zero."""
+    slopes = answers["plain"].slopes
+    assert slopes is not None
+    zero = not any(np.any(x) for x in slopes)
+    promise(zero, f"{name}: its gradient is not zero, though it was said to be.")
