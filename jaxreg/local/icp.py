@@ -191,8 +191,8 @@ class ICP(AbstractRegistrar):
         )
         end = ended.state
         T, scale = end.T, end.scale
-        held = descending.limits.floor
-        width = jnp.where(end.width == held, limits.floor, end.width)
+        at_floor = end.width == descending.limits.floor
+        width = jnp.where(at_floor, limits.floor, end.width)
         if isinstance(self.adjoint, ImplicitAdjoint):
             T, scale = stationary(optimiser, problem, width, limits, end)
 
@@ -203,21 +203,14 @@ class ICP(AbstractRegistrar):
         worse = self._worse_than(lax.stop_gradient(end), frozen, frozen_found, limits)
         T = jnp.where(worse, init, T)
         scale = jnp.where(worse, start_scale, scale)
-
-        spacing = jnp.maximum(
-            spacing, scale * median_spacing(source.points, source.mask)
-        )
-        there = score_match(found, spacing)
-        back = self._score_of_target(
-            source, target, lax.stop_gradient(T), scale, spacing
-        )
+        there, overlap = self._scores(source, target, found, (T, scale), spacing)
         free = is_degenerate(self.residual, frozen_found, weight)
         T = lie.compose(scale * lie.rotation(T), lie.translation(T))
         status = _status(T, ended.status, free, there, worse)
         curvature = Curvature.of(
             optimiser, problem.scaled(scale), end.T_matched, found, end.width
         )
-        overlap, rmse = mutual_overlap(there, back), there.inlier_rmse
+        rmse = there.inlier_rmse
         modes = Modes.alone(T, there.fitness, overlap, rmse, curvature.covariance)
         return RegistrationSolution(
             T_target_source=T,
@@ -276,6 +269,24 @@ class ICP(AbstractRegistrar):
         # error, and a guess is not worth more than an end within that.
         chance = lax.rsqrt(jnp.maximum(jnp.sum(mask), 1).astype(end.width.dtype))
         return loss(end.first_sq_residual[: len(last)]) < (1 - chance) * loss(last)
+
+    def _scores(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        found: Match,
+        pose: tuple[Motion, Scalar],
+        spacing: Scalar,
+    ) -> tuple[Score, Scalar]:
+        """Of the source by its match, and the overlap both ways."""
+        T, scale = pose
+        own = scale * median_spacing(source.points, source.mask)
+        spacing = jnp.maximum(spacing, own)
+        there = score_match(found, spacing)
+        back = self._score_of_target(
+            source, target, lax.stop_gradient(T), scale, spacing
+        )
+        return there, mutual_overlap(there, back)
 
     def _score_of_target(
         self,

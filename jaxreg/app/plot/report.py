@@ -70,30 +70,49 @@ def write_report(
         ValueError: if scans and poses do not have the same number.
     """
     clouds = [np.asarray(s) for s in scans]
-    result = solution
     if isinstance(solution, jaxreg.RegistrationSolution):
-        found = solution.modes
-        if modes is None:
-            modes = (
-                np.asarray(found.T_target_source),
-                np.asarray(found.weight),
-                np.asarray(found.fitness),
-            )
+        modes = _modes_of(solution) if modes is None else modes
         if covariances is None:
-            fixed = np.zeros_like(solution.covariance)
-            covariances = np.stack([fixed, np.asarray(solution.covariance)])
-    if not isinstance(result, Result):
-        result = result_of(result, clouds, names)
+            covariances = _covariances_of_pair(solution)
+    if not isinstance(solution, Result):
+        solution = result_of(solution, clouds, names)
     if covariances is None:
-        covariances = covariances_of(result)
+        covariances = covariances_of(solution)
+    labels = list(solution.names if names is None else names)
+    data = _page_data(clouds, solution, labels, modes, covariances, errors)
+    data["details"] = details_entry(details)
+    write_page(path, data["title"], data)
+
+
+def _modes_of(solution: "jaxreg.RegistrationSolution") -> tuple[np.ndarray, ...]:
+    """Its poses, their weights and fitness."""
+    found = solution.modes
+    every = (found.T_target_source, found.weight, found.fitness)
+    return tuple(np.asarray(x) for x in every)
+
+
+def _covariances_of_pair(solution: "jaxreg.RegistrationSolution") -> np.ndarray:
+    """Of the target, which stays, and of the source."""
+    covariance = np.asarray(solution.covariance)
+    return np.stack([np.zeros_like(covariance), covariance])
+
+
+def _page_data(
+    clouds: list[np.ndarray],
+    result: Result,
+    labels: list[str],
+    modes: tuple[np.ndarray, ...] | None,
+    covariances: Any,
+    errors: Mapping[str, Any] | None,
+) -> dict[str, Any]:
+    """What the page shows, but for how it was made."""
     num = len(result.T_world_i)
     if len(clouds) != num:
         raise ValueError(f"scans: wanted {num} like the poses, found {len(clouds)}.")
-    labels = list(result.names if names is None else names)
     camera = _camera(clouds, result.T_world_i, result.placed)
     points = page_points(clouds, result.T_world_i, result.component, camera)
     pair = len(labels) == 2 and modes is not None
-    data = {
+    return {
         "kind": "scans",
         "title": _title(labels, pair, result.num_components),
         "dim": clouds[0].shape[1],
@@ -105,9 +124,7 @@ def write_report(
         "modes": _mode_rows(modes) if pair and modes is not None else [],
         "errors": None if errors is None else dict(errors),
         "curves": trace_curves(result.trace),
-        "details": details_entry(details),
     }
-    write_page(path, data["title"], data)
 
 
 def _camera(

@@ -56,43 +56,70 @@ def write_graph_report(
     """
     if before is None:
         before = jaxreg.average(graph, method=jaxreg.ShortestPaths())
-    T = np.asarray(solution.T_world_i, np.float64)
-    labels = [str(x) for x in (range(len(T)) if names is None else names)]
-    placed = np.asarray(solution.placed, bool)
-    keep = np.asarray(graph.mask)
-    edges = np.asarray(graph.edges)[keep]
-    weight = np.asarray(solution.edge_weight, np.float64)[keep]
-    origin = np.median(T[placed][:, :-1, -1], axis=0)
-    old = np.asarray(before.T_world_i, np.float64)
-    angle, distance = residuals(T, edges, np.asarray(graph.T_i_j)[keep])
-    if covariances is None and len(T) <= MAX_COVARIANCES:
+    num = graph.num_poses
+    labels = [str(x) for x in (range(num) if names is None else names)]
+    if covariances is None and num <= MAX_COVARIANCES:
         covariances = jaxreg.pose_covariances(graph, solution)
-    title = f"{len(T):,} poses from {len(edges):,} edges"
-    data = {
-        "kind": "graph",
-        "title": title,
-        "dim": graph.dim,
-        "status": status_entry(Status(int(solution.status))),
+    sigma = deviations(covariances, num)
+    edges = _edge_data(graph, solution)
+    title = f"{num:,} poses from {int(np.sum(graph.mask)):,} edges"
+    poses = _pose_data(solution, before, labels, sigma)
+    how = _solver_data(solution)
+    data = {"kind": "graph", "title": title, "dim": graph.dim, **poses, **edges, **how}
+    data["details"] = details_entry(details)
+    write_page(path, title, data)
+
+
+def _pose_data(
+    solution: "jaxreg.AveragingSolution",
+    before: "jaxreg.AveragingSolution",
+    labels: list[str],
+    sigma: np.ndarray,
+) -> dict[str, Any]:
+    """Positions before and after, about their middle, and the table of poses."""
+    T = np.asarray(solution.T_world_i, np.float64)
+    old = np.asarray(before.T_world_i, np.float64)
+    placed = np.asarray(solution.placed, bool)
+    origin = np.median(T[placed][:, :-1, -1], axis=0)
+    return {
         "camera": _camera_on_path(T),
         "num_placed": int(placed.sum()),
         "num_poses": len(T),
-        "num_trusted": int(np.sum(weight > 0.5)),
         "before": floats(old[:, :-1, -1] - origin),
         "after": floats(T[:, :-1, -1] - origin),
         "placed": raw(placed.astype(np.uint8)),
+        "names": labels,
+        "scans": _rows(labels, placed, T, sigma),
+    }
+
+
+def _edge_data(
+    graph: "jaxreg.PoseGraph", solution: "jaxreg.AveragingSolution"
+) -> dict[str, Any]:
+    """Edges that are not masked, their trust and how far they are off."""
+    keep = np.asarray(graph.mask)
+    edges = np.asarray(graph.edges)[keep]
+    weight = np.asarray(solution.edge_weight, np.float64)[keep]
+    T = np.asarray(solution.T_world_i, np.float64)
+    angle, distance = residuals(T, edges, np.asarray(graph.T_i_j)[keep])
+    return {
+        "num_trusted": int(np.sum(weight > 0.5)),
         "edges": raw(edges.astype("<i4")),
         "weight": floats(weight),
         "angle": floats(angle),
         "distance": floats(distance),
-        "names": labels,
-        "scans": _rows(labels, placed, T, deviations(covariances, len(T))),
+    }
+
+
+def _solver_data(solution: "jaxreg.AveragingSolution") -> dict[str, Any]:
+    """How the method came to rest."""
+    return {
+        "status": status_entry(Status(int(solution.status))),
         "kernel_width": np.asarray(solution.kernel_width, np.float64).tolist(),
         "steps": int(solution.num_steps),
         "residual": float(solution.residual),
         "curves": trace_curves(solution.trace, int(solution.num_steps)),
-        "details": details_entry(details),
     }
-    write_page(path, title, data)
 
 
 def _rows(
