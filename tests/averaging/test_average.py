@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm, logm
+from scipy.spatial.transform import Rotation
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import (
@@ -22,7 +23,7 @@ from jaxreg.averaging.steps.gauss_newton import (
     gauss_newton_step,
 )
 from jaxreg.averaging.steps.iterate import iterate
-from jaxreg.averaging.steps.kernel_width import gaussian_trust
+from jaxreg.averaging.steps.kernel_width import annealed_width, gaussian_trust
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_error, translation_error
 from tests.averaging.graphs import random_graph
@@ -177,6 +178,33 @@ def test_kernel_width_is_three_deviations_of_the_noise():
         found.append(average(single(X, edges, T), METHODS["annealed"]).kernel_width)
     width = np.median(found, axis=0)
     np.testing.assert_allclose(width, [3 * 0.005, 3 * np.deg2rad(0.5)], rtol=0.2)
+
+
+def test_the_next_width_is_solved_from_the_mean_square_inside_the_present_one():
+    # Of 100 edges 56 hold exactly, the others are as far off as the kernel is wide: not
+    # normal noise, of which the middle edge would tell as much as the mean.
+    num, exact, width = 100, 56, np.array([0.04, 0.08])
+    rng = np.random.default_rng(0)
+    X, edges, _, _ = random_graph(15, num, 0.0, 0)
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]]
+    axis, shift = rng.normal(size=(2, num, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    shift /= np.linalg.norm(shift, axis=1, keepdims=True)
+    off = (np.arange(num) >= exact)[:, None]
+    T[:, :3, :3] = (
+        T[:, :3, :3] @ Rotation.from_rotvec(width[1] * off * axis).as_matrix()
+    )
+    T[:, :3, 3] += width[0] * off * shift
+    graph = PoseGraph.from_edges(edges, T.astype(np.float32), 15)
+    poses = jnp.asarray(X, jnp.float32)
+    found = annealed_width(graph, poses, jnp.asarray(width), jnp.asarray(1.0))
+    # Gaussian weights: each kind of error at one width, so exp(-1/2) of either.
+    trust = np.exp(-1.0)
+    count = exact + (num - exact) * trust
+    square = (num - exact) * trust / 3 / count  # of a component, in widths
+    variance = 1 / (1 / square - 1) * count / (count - 14)
+    assert 9 * variance < 1
+    np.testing.assert_allclose(found, 3 * width * np.sqrt(variance), rtol=5e-3)
 
 
 def test_edge_weights_name_the_outliers():

@@ -128,6 +128,19 @@ def test_the_likeliest_deviation_and_the_odds_are_those_of_right_edges():
     np.testing.assert_array_equal(np.asarray(found.log_odds) > 0, ~bad)
 
 
+def test_of_the_agreed_edges_those_of_a_tree_do_not_count():
+    X, edges, T, bad = random_graph(32, 200, 0.3, 0)
+    graph, true = single(edges, T, 32), jnp.asarray(X, jnp.float32)
+    share = likelihood.agreed_share(graph, true)
+    assert share == pytest.approx((np.sum(~bad) - 31) / (200 - 31), abs=1e-6)
+    found = explained(graph, true)
+    # Terms r^2 / (2 s^2) of right edges have the variance D / 2; each is right nearly
+    # for sure.
+    chance = np.sqrt(0.8 / 2 * np.sum(~bad))
+    least = likelihood.least_after_fitting(found)
+    assert float(found.log_ratio - least) == pytest.approx(chance, rel=0.05)
+
+
 def test_near_views_tell_the_truth_from_a_larger_group_of_wrong_motions():
     for seed in range(3):
         X, folded, edges, T = folding_graph(seed)
