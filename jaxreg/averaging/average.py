@@ -80,9 +80,10 @@ def average(
         frame 0 by edges of positive weight, see `placed`.
         NON_FINITE: edges or poses with NaN or inf were met; such edges are ignored,
         such poses returned as the identity.
-        MAX_STEPS: the steps ran out. NO_AGREEMENT, of `Correntropy`: there are more
-        motions than a tree needs, and nothing agrees beyond what any tree agrees with
-        (`log_evidence` is at most 0).
+        MAX_STEPS: the steps ran out. NO_AGREEMENT: there are more motions than a tree
+        needs, and nothing agrees beyond what any tree agrees with (`log_evidence` is
+        at most 0, and so is that of the spanning tree of greatest weight); the poses
+        of `Correntropy` are then those of its start.
 
     Raises:
         TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,

@@ -4,6 +4,7 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -12,7 +13,7 @@ from jaxreg._core.checks import is_concrete
 from jaxreg._core.loop import status_of
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, StatusArray
-from jaxreg.averaging.likelihood import log_evidence
+from jaxreg.averaging.likelihood import log_evidence, nothing_agrees
 from jaxreg.averaging.measures import frobenius, length_scale, weighted_mean
 from jaxreg.averaging.trace import AveragingTrace
 from jaxreg.graph.pose_graph import PoseGraph
@@ -108,17 +109,20 @@ def solution(
     done = jnp.asarray(True) if converged is None else converged
     width = jnp.full((2,), jnp.inf, dtype) if kernel_width is None else kernel_width
     trust = jnp.where(graph.mask & (graph.weight > 0), trust, 0)
+    evidence = log_evidence(graph, T_world_i)
+    none = nothing_agrees(jax.lax.stop_gradient(graph), evidence)
+    status = jnp.where(none, Status.NO_AGREEMENT, status_of(done))
     return AveragingSolution(
         T_world_i=T_world_i,
         edge_weight=trust,
         agreement=weighted_mean((trust > 0.5).astype(dtype), graph.weight),
-        status=status_of(done),
+        status=status.astype(jnp.int32),
         placed=jnp.ones(T_world_i.shape[:1], dtype=bool),
         component=jnp.zeros(T_world_i.shape[:1], dtype=jnp.int32),
         kernel_width=width,
         num_steps=jnp.asarray(num_steps, jnp.int32),
         residual=weighted_mean(frobenius(graph, T_world_i, scale), graph.weight),
-        log_evidence=log_evidence(graph, T_world_i),
+        log_evidence=evidence,
         length_scale=scale,
         trace=trace,
     )

@@ -38,10 +38,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.averaging.measures import length_scale, nearest_rank, num_held
 from jaxreg.geometry import lie
+from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph, product
 
 
@@ -89,6 +90,24 @@ def log_evidence(
     return explained(graph, T_world_i, alone=True).log_ratio
 
 
+def nothing_agrees(graph: PoseGraph, evidence: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether there are edges to spare, and no evidence that any agrees.
+
+    Args:
+        graph: whose frames are all joined.
+        evidence: `log_evidence` of the answer. Where it has none, because wrong motions
+            pulled on it, the spanning tree of greatest weight may have some.
+    """
+    spare = jnp.sum(graph.weight > 0) > num_held(graph) - 1
+
+    def of_tree() -> Array:
+        args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
+        return log_evidence(graph, trees.maximum_spanning_tree(*args).T_world_i) <= 0
+
+    none = spare & (evidence <= 0)
+    return jax.lax.cond(none, of_tree, lambda: jnp.asarray(False))
+
+
 def explained(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"], *, alone: bool = False
 ) -> Explained:
@@ -98,12 +117,16 @@ def explained(
         graph: whose frames are all joined.
         T_world_i: `(v, d+1, d+1)`.
         alone: each wrong motion is wrong on its own (D = k), and the deviation is that
-            of a component; else wrong ones may agree with each other.
+            of a component, at most a quarter: at a half, what poses fitted to random
+            motions gain is more than Laplace's method takes off. Else wrong ones may
+            agree with each other.
 
     Gradients: none (cut).
     """
-    dimension = lie.tangent_dim(graph.dim) if alone else _DIMENSION
-    return _explained(graph, T_world_i, float(dimension))
+    if alone:
+        dimension = float(lie.tangent_dim(graph.dim))
+        return _explained(graph, T_world_i, dimension, DEVIATIONS[1:])
+    return _explained(graph, T_world_i, _DIMENSION, DEVIATIONS)
 
 
 def least_after_fitting(found: Explained) -> Float[Array, ""]:
@@ -131,7 +154,9 @@ def agreed_share(
     return (right - tree) / count
 
 
-def _explained(graph: PoseGraph, T_world_i: Array, dimension: float) -> Explained:
+def _explained(
+    graph: PoseGraph, T_world_i: Array, dimension: float, deviations: tuple[float, ...]
+) -> Explained:
     graph, T_world_i = jax.lax.stop_gradient((graph, T_world_i))
     sq, weigh = squared_errors(graph, T_world_i), prior_odds(graph)
     log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
@@ -159,9 +184,9 @@ def _explained(graph: PoseGraph, T_world_i: Array, dimension: float) -> Explaine
         both = near[:, None] + far[None]  # near, far, t
         return jnp.where(allowed[..., None], both, -jnp.inf) - free * most
 
-    ladder = jnp.asarray(DEVIATIONS, sq.dtype)
+    ladder = jnp.asarray(deviations, sq.dtype)
     every = jax.lax.map(terms, ladder)
-    count = len(DEVIATIONS) * len(_NEAREST) * jnp.sum(allowed)
+    count = len(deviations) * len(_NEAREST) * jnp.sum(allowed)
     s, near, far, t = jnp.unravel_index(jnp.argmax(every), every.shape)
     p = jnp.where(is_near[t] > 0, log_odds[near], log_odds[far])
     right = p + weigh + log_gain(ladder[s])[0]

@@ -68,10 +68,12 @@ def _solution(
     graph = PoseGraph(found.pairs, T_i_j, weight, real, None, scans.num_scans)
     component, placed = placement.component, placement.placed
     scan_status = jnp.where(component < 0, Status.LOW_OVERLAP, Status.DISCONNECTED)
-    scan_status = jnp.where(placed, Status.CONVERGED, scan_status)
+    agreed = placement.status != Status.NO_AGREEMENT
+    found_status = jnp.where(agreed, Status.CONVERGED, Status.NO_AGREEMENT)
+    scan_status = jnp.where(placed, found_status, scan_status)
     scan_status = jnp.where(free & (component >= 0), Status.AMBIGUOUS, scan_status)
     scan_status = jnp.where(scans.usable, scan_status, scans.fault)
-    status = jnp.where(jnp.any(free & placed), Status.AMBIGUOUS, Status.CONVERGED)
+    status = jnp.where(jnp.any(free & placed), Status.AMBIGUOUS, found_status)
     status = jnp.where(jnp.all(placed), status, Status.DISCONNECTED)
     trace = placement.trace
     return ReconstructionSolution(

@@ -93,7 +93,7 @@ def place(
     The root is the scan of lowest number in the largest connected set of scans. The
     other sets of two and more are averaged with it, each hung on it by one motion of no
     consequence. Overlap is evidence of its own, so averaging starts from the spanning
-    tree of largest overlap.
+    tree of largest overlap, and stays there where no pairs agree with each other.
     """
     if averaging is None:
         averaging = Correntropy(initialiser=SpanningTree())

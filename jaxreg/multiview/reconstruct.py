@@ -82,6 +82,8 @@ def reconstruct(
     Fails:
         DISCONNECTED where some scans could not be placed, AMBIGUOUS where some can slip
         along the others; `scan_status` says which, and what is wrong with them.
+        NO_AGREEMENT where no pairs agree with each other: scans then lie as the pairs
+        of largest overlap have them.
 
     Gradients:
         None; the search is cut.

@@ -21,12 +21,14 @@ class ReconstructionSolution(eqx.Module):
         T_world_i: `(v, d+1, d+1)` maps scan i to the world of its component, which is
             the frame of the component's first scan. Identity for scans alone.
         status: int32; CONVERGED if every scan is placed, AMBIGUOUS if some of them
-            could as well lie otherwise, else DISCONNECTED.
-        scan_status: `(v,)` int32; CONVERGED where placed, DISCONNECTED in another
-            component; AMBIGUOUS where the surfaces of no two scans together keep a
-            scan from slipping along the rest of its component, as of spheres, or where
-            all its pairs overlap as much in another mode, as of cubes; of scans that
-            join no other LOW_OVERLAP, TOO_FEW_POINTS, or UNIT_DIFFERS.
+            could as well lie otherwise, NO_AGREEMENT if no pairs agree with each other;
+            DISCONNECTED if some are not placed.
+        scan_status: `(v,)` int32; CONVERGED (or NO_AGREEMENT, see `status`) where
+            placed, DISCONNECTED in another component; AMBIGUOUS where the surfaces of
+            no two scans together keep a scan from slipping along the rest of its
+            component, as of spheres, or where all its pairs overlap as much in another
+            mode, as of cubes; of scans that join no other LOW_OVERLAP, TOO_FEW_POINTS,
+            or UNIT_DIFFERS.
         placed: `(v,)` the scans of component 0.
         component: `(v,)` int32, the scans that trusted pairs join have one number: 0 is
             the component of most scans, -1 stands for scans alone. Nothing is known

@@ -6,10 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
+import jaxreg as jr
 from jaxreg import Status
 from jaxreg.averaging import MotionAveraging, average, likelihood
 from jaxreg.graph import PoseGraph
-from tests.averaging.graphs import folding_graph, random_graph
+from tests.averaging.graphs import (
+    folding_graph,
+    motions,
+    random_graph,
+    rotations,
+)
 
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -24,7 +30,7 @@ def single(edges, T, num: int, **kwargs) -> PoseGraph:
     return PoseGraph.from_edges(edges, T.astype(np.float32), num, **kwargs)
 
 
-def naive(X, edges, T, weight, dimension) -> float:
+def naive(X, edges, T, weight, dimension, deviations) -> float:
     """Log Lambda, edge by edge in float64."""
     d, k = X.shape[-1] - 1, 3 * X.shape[-1] - 6
     length = np.linalg.norm(T[:, :d, d], axis=1)
@@ -51,7 +57,7 @@ def naive(X, edges, T, weight, dimension) -> float:
     odds = [-4.5, -3, -1.5, 0, 1.5, 3, 4.5]
     prior = weight / np.sort(weight)[round(0.5 * (len(weight) - 1))]
     terms = []
-    for s in 0.5 / 2.0 ** np.arange(8):
+    for s in deviations:
         gain = (reach / s) ** dimension * np.exp(-np.array(sq) / (2 * s**2))
         for t in (4, 8):
             for near in odds[3:]:
@@ -71,9 +77,10 @@ def test_against_a_sum_over_edges_and_shares(d, outliers):
     graph = single(edges, T, N, weight=weight.astype(np.float32))
     for poses in (X, random_graph(N, H, 0.0, 1, d=d)[0]):
         of = jnp.asarray(poses, jnp.float32)
-        expected = naive(poses, edges, T, weight, {2: 3, 3: 6}[d])
+        ladder = 0.5 / 2.0 ** np.arange(8)
+        expected = naive(poses, edges, T, weight, {2: 3, 3: 6}[d], ladder[1:])
         np.testing.assert_allclose(log_evidence(graph, of), expected, rtol=2e-3)
-        expected = naive(poses, edges, T, weight, 0.8)
+        expected = naive(poses, edges, T, weight, 0.8, ladder)
         found = explained(graph, of)
         np.testing.assert_allclose(found.log_ratio, expected, rtol=2e-3, atol=1e-2)
 
@@ -148,6 +155,33 @@ def test_near_views_tell_the_truth_from_a_larger_group_of_wrong_motions():
         true, wrong = (jnp.asarray(P, jnp.float32) for P in (X, folded))
         assert log_evidence(graph, wrong) > log_evidence(graph, true)
         assert explained(graph, true).log_ratio > explained(graph, wrong).log_ratio
+
+
+METHODS = [
+    jr.Correntropy(),
+    jr.Correntropy(initialiser=jr.SpanningTree()),
+    jr.MCC(),
+    MotionAveraging(),
+    jr.WeightedMotionAveraging(),
+    jr.PoseGraphLM(),
+    jr.LowRankSparse(),
+    jr.SpanningTree(),
+    jr.ShortestPaths(),
+]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=repr)
+def test_random_motions_agree_with_no_method(method):
+    for seed in range(5):
+        X, edges, _, _ = random_graph(8, 28, 0.0, seed)
+        rng = np.random.default_rng(seed)
+        wild = motions(rotations(rng, 28, 3, None), rng.uniform(-1, 1, (28, 3)))
+        found = average(single(edges, wild, 8), method)
+        assert found.status == Status.NO_AGREEMENT
+        assert found.log_evidence <= 0
+        right = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]]
+        wild[4:] = right[4:]
+        assert average(single(edges, wild, 8), method).status != Status.NO_AGREEMENT
 
 
 def test_where_nothing_agrees_the_status_says_so():

@@ -206,10 +206,6 @@ def test_spheres_are_ambiguous(sculpture):
     assert np.sum(np.asarray(sol.scan_status) == Status.AMBIGUOUS) >= 7
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="motions that all contradict each other join no scans: DISCONNECTED",
-)
 def test_cubes_are_ambiguous():
     # Each fits the others in 24 poses.
     cubes = []

@@ -12,11 +12,14 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_parts
-from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
-from jaxreg.averaging.likelihood import explained, least_after_fitting
-from jaxreg.averaging.measures import length_scale, num_held
+from jaxreg.averaging.likelihood import (
+    explained,
+    least_after_fitting,
+    log_evidence,
+)
+from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.methods.graduated import graduated
 from jaxreg.averaging.methods.motion_averaging import iterate_plain
 from jaxreg.averaging.start.closures import without_lone_closures
@@ -93,13 +96,14 @@ class Correntropy(AbstractAverager):
     def _large(
         self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
     ) -> AveragingSolution:
-        return _judged(graph, self._graduated(graph, init, key))
+        return solution_of(graph, self._graduated(graph, init, key))
 
     @eqx.filter_jit
     def _small(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"]
     ) -> AveragingSolution:
-        return _judged(graph, self._annealed(graph, T_start))
+        end = self._annealed(graph, T_start)
+        return solution_of(graph, _or_start(graph, end, T_start))
 
     def _annealed(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
         """From the likeliest width; from half of it where that loses likelihood.
@@ -155,14 +159,18 @@ class Correntropy(AbstractAverager):
         return graduated(graph, near, jnp.stack(starts), self.max_steps)
 
 
-def _judged(graph: PoseGraph, end: Iterated) -> AveragingSolution:
-    """The solution; NO_AGREEMENT if there are edges to spare, and none agrees."""
-    found = solution_of(graph, end)
-    spare = jnp.sum(graph.weight > 0) > num_held(graph) - 1
-    status = jnp.where(
-        spare & (found.log_evidence <= 0), Status.NO_AGREEMENT, found.status
+def _or_start(graph: PoseGraph, end: Iterated, T_start: Array) -> Iterated:
+    """The start where nothing agrees at the end: a wide kernel then blurs its tree.
+
+    Trust is then the probability that an edge is right if the start is.
+    """
+    graph, T_start = jax.lax.stop_gradient((graph, T_start))
+    nothing = log_evidence(graph, end.T_world_i) <= 0
+    right = jax.nn.sigmoid(explained(graph, T_start, alone=True).log_odds)
+    return end._replace(
+        T_world_i=jnp.where(nothing, T_start, end.T_world_i),
+        trust=jnp.where(nothing, right, end.trust),
     )
-    return eqx.tree_at(lambda s: s.status, found, status.astype(jnp.int32))
 
 
 def _better_start(
