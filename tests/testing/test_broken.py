@@ -1,5 +1,7 @@
 """Each check tells a promise that is broken, in a sentence."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -228,7 +230,10 @@ class Dynamics(jr.AbstractDynamics):
     """Half of the motion error again, or what `twist` makes of it."""
 
     twist: str = eqx.field(default="", static=True)
-    needs_path = False
+
+    @property
+    def needs_path(self):
+        return False
 
     def __call__(self, key, particles, time):
         T, error = particles.T_target_source, particles.motion_error
@@ -308,7 +313,7 @@ class Prior(jr.AbstractPrior):
             T = T.at[:, 0].multiply(-1)
         return T if self.twist == "promotes" else T.astype(dtype)
 
-    def in_frames(self, frames):
+    def in_frames(self, frames) -> Any:
         if self.twist == "forgets":
             return UniformPrior()
         return None if self.twist == "no frames" else self
