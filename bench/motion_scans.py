@@ -53,13 +53,14 @@ def estimate(name: str, data: Path, seed: int) -> Motions:
     """Registers all pairs of a set."""
     title, scans, T_true = load_scans(name, data)
     found = jax.block_until_ready(reconstruct(scans, key=jax.random.key(seed)))
-    overlap = np.asarray(found.overlap)
+    overlap, rows = np.asarray(found.overlap), np.arange(found.overlap.size)
+    log_evidence = np.asarray(found.motions.log_evidence)[rows, np.asarray(found.mode)]
     return Motions(
         name=f"{title}, seed {seed}",
         edges=np.asarray(found.graph.edges),
         T_i_j=_in_mm(np.asarray(found.graph.T_i_j)),
         overlap=overlap,
-        trusted=overlap >= jaxreg.ParticleFilter().min_overlap,
+        trusted=log_evidence >= jaxreg.ParticleFilter().min_log_evidence,
         T_true=_in_mm(T_true),
     )
 

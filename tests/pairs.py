@@ -46,10 +46,11 @@ class Centroids(AbstractRegistrar):
             inlier_rmse=zero,
             num_inliers=jnp.sum(source.mask, dtype=jnp.int32),
             overlap=zero,
+            log_evidence=zero,
             num_steps=count,
             H=H,
             b=H[0],
             error=zero,
             covariance=H,
-            modes=Modes.alone(T, zero, zero, zero, H),
+            modes=Modes.alone(T, zero, zero, zero, zero, H),
         )

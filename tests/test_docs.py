@@ -24,8 +24,8 @@ ROOT = Path(__file__).parents[1]
 #: What the table of statuses says of thresholds.
 THRESHOLDS = {
     jr.Status.DEGENERATE: (curvature._DEGENERATE, ascent._FREE),
-    jr.Status.LOW_OVERLAP: (float(jnp.asarray(jr.ParticleFilter().min_overlap)),),
-    jr.Status.AMBIGUOUS: (conclude.RIVAL_OVERLAP, conclude._RIVAL_WEIGHT),
+    jr.Status.LOW_OVERLAP: (float(jnp.asarray(jr.ParticleFilter().min_log_evidence)),),
+    jr.Status.AMBIGUOUS: (conclude.RIVAL_MARGIN,),
     jr.Status.DISCONNECTED: (place._MIN_TRUST,),
     jr.Status.UNIT_DIFFERS: (prepare._OTHER_UNIT,),
 }

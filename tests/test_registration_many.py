@@ -121,7 +121,7 @@ def test_padding_changes_an_answer_by_rounding_only(name, compiled):
     init = [motion(9, 3, angle=0.1, shift=0.05) @ x for x in T]
     if name == "filter":
         method, init, key = FILTER, None, jax.random.key(7)
-        other = dataclasses.replace(method, min_overlap=0.2)
+        other = dataclasses.replace(method, min_log_evidence=2.0)
         keys = list(jax.random.split(key, 3))
     else:
         method, key, keys = jr.ICP(), None, [None] * 3

@@ -18,15 +18,16 @@ from jaxreg.io.errors import InputError
 from jaxreg.io.files import reading, require_regular
 
 
-_FORMAT = "jaxreg pairs 2"
+_FORMAT = "jaxreg pairs 3"
 
 
 class Pairs(NamedTuple):
-    """The modes of pairs: `(e, 2)` ids, `(e, m, d+1, d+1)`, `(e, m)` and `(e, m)`."""
+    """The modes of pairs: `(e, 2)` ids, `(e, m, d+1, d+1)`, and three of `(e, m)`."""
 
     edges: np.ndarray
     T_i_j: np.ndarray
     overlap: np.ndarray
+    log_evidence: np.ndarray
     inlier_rmse: np.ndarray
 
 
@@ -79,6 +80,7 @@ class PairLog:
             np.array([row["pair"] for row in rows], np.int32),
             np.array([row["T_i_j"] for row in rows]),
             np.array([row["overlap"] for row in rows]),
+            np.array([row["log_evidence"] for row in rows]),
             np.array([row["inlier_rmse"] for row in rows]),
         )
 
@@ -90,6 +92,7 @@ class PairLog:
                     "pair": found.edges[e].tolist(),
                     "T_i_j": found.T_i_j[e].tolist(),
                     "overlap": found.overlap[e].tolist(),
+                    "log_evidence": found.log_evidence[e].tolist(),
                     "inlier_rmse": found.inlier_rmse[e].tolist(),
                 }
             )
@@ -165,12 +168,13 @@ def _checked(line: str, num_scans: int, dim: int) -> tuple[frozenset[int], int]:
     i, j = row["pair"]
     if type(i) is not int or type(j) is not int:
         raise TypeError("ids are integers")
-    T, overlap, rmse = (
-        np.array(row[k], np.float64) for k in ("T_i_j", "overlap", "inlier_rmse")
+    T, *told = (
+        np.array(row[k], np.float64)
+        for k in ("T_i_j", "overlap", "log_evidence", "inlier_rmse")
     )
     known = all(0 <= k < num_scans for k in (i, j)) and i != j
     shaped = T.shape == (len(T), dim + 1, dim + 1) and len(T) > 0
-    finite = np.isfinite(T).all() and np.isfinite(overlap).all()
-    if not (known and shaped and finite and overlap.shape == rmse.shape == (len(T),)):
+    finite = all(np.isfinite(x).all() for x in (T, *told[:2]))
+    if not (known and shaped and finite and all(x.shape == (len(T),) for x in told)):
         raise ValueError("no pair of these scans")
     return frozenset((i, j)), len(T)

@@ -4,10 +4,12 @@ Finer where samples are sparse and uneven than the cells of `normals.py`, indepe
 of the orientation of the axes, and ten times slower.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Mask, Points
+from jaxreg.cloud.point_cloud import num_around, spacing_around
 from jaxreg.geometry.eigen import least_eigenvectors
 from jaxreg.neighbours import BruteForce
 
@@ -22,8 +24,10 @@ def normals_from_neighbours(
     count: Float[Array, " n"],
     spread: Float[Array, "n d d"],
     num_neighbours: int,
-) -> Float[Array, "n d"]:
-    """Unit normals of either sign of the valid places; zero where undefined.
+) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
+    """Unit normals of either sign of the valid places, and the spacing around them.
+
+    Zero where undefined.
 
     A place stands for `count` points with mean there and summed outer products of
     offsets `spread`; a normal is the direction of least spread of all the points of
@@ -46,4 +50,5 @@ def normals_from_neighbours(
     entries = jnp.stack([jnp.stack(line) for line in moments])
     vectors, second, largest = least_eigenvectors(entries)
     flat = mask & (largest > 0) & (second > _SPAN * largest)
-    return jnp.where(flat, vectors, 0).T
+    near = jax.tree.map(lambda x: x[:, : 1 + num_around(d)], found)
+    return jnp.where(flat, vectors, 0).T, spacing_around(near, mask)

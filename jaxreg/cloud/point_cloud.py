@@ -1,11 +1,14 @@
 """`PointCloud`: points with normals and a mask."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.arrays import spread_rows
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Mask, Points
 from jaxreg.cloud.range_image import RangeImage
+from jaxreg.neighbours import BruteForce, Neighbours
 
 
 class PointCloud(BriefModule):
@@ -16,12 +19,15 @@ class PointCloud(BriefModule):
         normals: `(n, d)` unit normals of either sign; zero where undefined.
         mask: `(n,)` True for valid points.
         seen: what the scanner saw of them, where its viewpoint is known.
+        spacing: `(n,)` mean distance to the nearest other points, two on a curve and
+            four on a surface, where it is known (`with_spacing`).
     """
 
     points: Float[Array, "n d"]
     normals: Float[Array, "n d"]
     mask: Bool[Array, " n"]
     seen: RangeImage | None = None
+    spacing: Float[Array, " n"] | None = None
 
     def padded(self, num: int) -> "PointCloud":
         """With masked rows behind it, `num` in all."""
@@ -31,17 +37,60 @@ class PointCloud(BriefModule):
             jnp.pad(self.normals, (rows, (0, 0))),
             jnp.pad(self.mask, rows),
             self.seen,
+            None if self.spacing is None else jnp.pad(self.spacing, rows),
         )
 
     def first(self, num: int) -> "PointCloud":
         """The first `num` rows, or all."""
-        points, normals = self.points[:num], self.normals[:num]
-        return PointCloud(points, normals, self.mask[:num], self.seen)
+        return self.of_rows(slice(num))
+
+    def of_rows(self, rows: Int[Array, " r"] | slice) -> "PointCloud":
+        """Some of the rows, which keep the spacing that they have among all."""
+        return PointCloud(
+            self.points[rows],
+            self.normals[rows],
+            self.mask[rows],
+            self.seen,
+            None if self.spacing is None else self.spacing[rows],
+        )
+
+    def spread(self, num: int) -> "PointCloud":
+        """At most so many valid rows, spread over the array; no spacing is known."""
+        if len(self.mask) <= num:
+            return self
+        rows, use = spread_rows(self.mask, num)
+        some = self.of_rows(rows)
+        return PointCloud(some.points, some.normals, use, self.seen)
 
     def seen_from(self, viewpoint: Float[Array, " d"]) -> "PointCloud":
         """With what was seen of it from there; of NaN nothing is known."""
         seen = RangeImage.of(self.points, self.mask, viewpoint)
-        return PointCloud(self.points, self.normals, self.mask, seen)
+        return PointCloud(self.points, self.normals, self.mask, seen, self.spacing)
+
+    def with_spacing(self) -> "PointCloud":
+        """With the spacing around each point, by comparing all pairs if not known."""
+        if self.spacing is not None:
+            return self
+        num = 1 + num_around(self.points.shape[1])
+        found = BruteForce.build(self.points, self.mask).query(self.points, num)
+        spacing = spacing_around(found, self.mask)
+        return PointCloud(self.points, self.normals, self.mask, self.seen, spacing)
+
+
+def num_around(d: int) -> int:
+    """Neighbours on a grid of a curve or a surface in d dimensions."""
+    return 2 * (d - 1)
+
+
+def spacing_around(found: Neighbours, mask: Mask) -> Float[Array, " n"]:
+    """Mean distance to the nearest others, of neighbours with the point itself first.
+
+    Zero of points that are not valid or have none. Gradients: cut.
+    """
+    sq = lax.stop_gradient(found.sq_distance[:, 1:])
+    valid = found.valid[:, 1:] & mask[:, None]
+    total = jnp.sum(jnp.where(valid, jnp.sqrt(jnp.maximum(sq, 0)), 0), axis=1)
+    return total / jnp.maximum(jnp.sum(valid, axis=1), 1)
 
 
 def levelled(a: PointCloud, b: PointCloud) -> tuple[PointCloud, PointCloud]:

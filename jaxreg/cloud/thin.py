@@ -26,6 +26,8 @@ def thin(
 ) -> PointCloud:
     """At most `capacity` points in spatial order, with normals from all the points.
 
+    And with the spacing around each, where neighbours are searched for.
+
     Points that share a cell are replaced by their mean; the cell is chosen as small
     as the capacity allows. A cloud whose valid points fit keeps them.
 
@@ -54,7 +56,7 @@ def thin(
         count = jax.ops.segment_sum(count, cell, capacity)
         total = jax.ops.segment_sum(places, cell, capacity)
         places, valid = total / jnp.maximum(count, 1)[:, None], count > 0
-    frozen = lax.stop_gradient(places)
+    frozen, spacing = lax.stop_gradient(places), None
     if num_neighbours is None:
         # Cells that merge many points are windows already.
         finest = jnp.where(num >= _MANY * capacity, 0, 1)
@@ -64,8 +66,11 @@ def thin(
         spread = jax.ops.segment_sum(
             offset[:, :, None] * offset[:, None, :], cell, len(valid)
         )
-        normals = normals_from_neighbours(frozen, valid, count, spread, num_neighbours)
-    return PointCloud(jnp.where(valid[:, None], places + low, 0), normals, valid)
+        normals, spacing = normals_from_neighbours(
+            frozen, valid, count, spread, num_neighbours
+        )
+    points = jnp.where(valid[:, None], places + low, 0)
+    return PointCloud(points, normals, valid, spacing=spacing)
 
 
 def estimate_normals(points: Points, mask: Mask) -> Points:

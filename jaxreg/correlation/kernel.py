@@ -1,7 +1,6 @@
 """Registration by kernel correlation, the rival in the PF paper's section 5.1."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -16,8 +15,7 @@ from jaxreg.correlation.ascent import Ascending, is_free, newton_step
 from jaxreg.correlation.quadratic import Quadratic, pull_on_target
 from jaxreg.geometry import lie
 from jaxreg.local import sandwich, turn_and_shift
-from jaxreg.matching import Score, mutual_overlap, score_both_ways
-from jaxreg.neighbours import exact_index
+from jaxreg.matching import Witness
 from jaxreg.registrar import AbstractRegistrar, Frames, Modes, RegistrationSolution
 
 
@@ -126,28 +124,30 @@ class KernelCorrelation(AbstractRegistrar):
         T = turn_and_shift(end.T, newton_step(held, model.b))
         T = jnp.where(ended.converged, T, end.T)
 
-        there, back = _scores(fixed[0], fixed[1], lax.stop_gradient(T), spacing)
+        evidence = Witness.of_some(*fixed[:2]).of_pose(lax.stop_gradient(T))
         status = jnp.where(is_free(held), Status.DEGENERATE, ended.status)
-        status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
+        status = jnp.where(evidence.overlap > 0, status, Status.LOW_OVERLAP)
         status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
         num_pairs = jnp.sum(source.mask, dtype=dtype) * jnp.sum(
             target.mask, dtype=dtype
         )
         covariance = _covariance(held, end.T, *fixed[:2], fixed[3])
-        overlap, rmse = mutual_overlap(there, back), there.inlier_rmse
+        e = evidence
+        told = e.fitness, e.overlap, e.inlier_rmse, e.log_evidence
         return RegistrationSolution(
             T_target_source=T,
             status=status.astype(jnp.int32),
-            fitness=there.fitness,
-            inlier_rmse=rmse,
-            num_inliers=there.num_inliers,
-            overlap=overlap,
+            fitness=evidence.fitness,
+            inlier_rmse=evidence.inlier_rmse,
+            num_inliers=evidence.num_inliers,
+            overlap=evidence.overlap,
+            log_evidence=evidence.log_evidence,
             num_steps=end.num_steps,
             H=held.H,
             b=held.b,
             error=fixed[3] ** 2 * (num_pairs - held.correlation),
             covariance=covariance,
-            modes=Modes.alone(T, there.fitness, overlap, rmse, covariance),
+            modes=Modes.alone(T, *told, covariance),
         )
 
     def width(self, spacing: Float[Array, ""]) -> Float[Array, ""]:
@@ -159,25 +159,6 @@ class KernelCorrelation(AbstractRegistrar):
         if self.bandwidth is None:
             return jnp.maximum(_RADII, _SPACINGS * spacing)
         return jnp.asarray(self.bandwidth)
-
-
-def _scores(
-    source: PointCloud, target: PointCloud, T: Motion, spacing: Float[Array, ""]
-) -> tuple[Score, Score]:
-    def indexed(cloud: PointCloud):
-        return exact_index(cloud.mask.shape[0]).build(cloud.points, cloud.mask)
-
-    both = score_both_ways(
-        source,
-        target,
-        indexed(source),
-        indexed(target),
-        T[None],
-        jnp.ones(1, bool),
-        spacing,
-    )
-    there, back = jax.tree.map(lambda x: x[0], both)
-    return there, back
 
 
 def _covariance(

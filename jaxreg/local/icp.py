@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from jaxreg._core.adjoint import AbstractAdjoint, ImplicitAdjoint
-from jaxreg._core.arrays import cast_floats, spread_rows, traced
+from jaxreg._core.arrays import cast_floats, traced
 from jaxreg._core.checks import (
     as_float_array,
     check_counts,
@@ -37,12 +37,11 @@ from jaxreg.local.implicit import stationary
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.scale import first_guess
 from jaxreg.local.steps import AbstractStep, GaussNewton
+from jaxreg.matching.evidence import Evidence, Witness
 from jaxreg.matching.problem import Match, Problem, match
 from jaxreg.matching.residuals import AbstractResidual, PlaneToPlane
-from jaxreg.matching.score import Score, mutual_overlap, score, score_match
 from jaxreg.neighbours import (
     AbstractIndex,
-    BruteForce,
     IndexBuilder,
     check_index,
     index_within,
@@ -57,8 +56,8 @@ from jaxreg.registrar import (
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
 
-# Points of the target that tell its share on the source, to 0.02.
-_SCORED_POINTS = 512
+# Of less evidence the end is no answer: at even odds, as a guess has as a rule.
+_LEAST_EVIDENCE = 0.0
 
 
 class ICP(AbstractRegistrar):
@@ -203,22 +202,24 @@ class ICP(AbstractRegistrar):
         worse = self._worse_than(lax.stop_gradient(end), frozen, frozen_found, limits)
         T = jnp.where(worse, init, T)
         scale = jnp.where(worse, start_scale, scale)
-        there, overlap = self._scores(source, target, found, (T, scale), spacing)
+        evidence = _evidence(source, target, T, scale)
         free = is_degenerate(self.residual, frozen_found, weight)
         T = lie.compose(scale * lie.rotation(T), lie.translation(T))
-        status = _status(T, ended.status, free, there, worse)
+        status = _status(T, ended.status, free, evidence, worse)
         curvature = Curvature.of(
             optimiser, problem.scaled(scale), end.T_matched, found, end.width
         )
-        rmse = there.inlier_rmse
-        modes = Modes.alone(T, there.fitness, overlap, rmse, curvature.covariance)
+        e = evidence
+        told = e.fitness, e.overlap, e.inlier_rmse, e.log_evidence
+        modes = Modes.alone(T, *told, curvature.covariance)
         return RegistrationSolution(
             T_target_source=T,
             status=status,
-            fitness=there.fitness,
-            inlier_rmse=rmse,
-            num_inliers=there.num_inliers,
-            overlap=overlap,
+            fitness=evidence.fitness,
+            inlier_rmse=evidence.inlier_rmse,
+            num_inliers=evidence.num_inliers,
+            overlap=evidence.overlap,
+            log_evidence=evidence.log_evidence,
             num_steps=end.num_steps,
             H=curvature.H,
             b=curvature.b,
@@ -270,54 +271,28 @@ class ICP(AbstractRegistrar):
         chance = lax.rsqrt(jnp.maximum(jnp.sum(mask), 1).astype(end.width.dtype))
         return loss(end.first_sq_residual[: len(last)]) < (1 - chance) * loss(last)
 
-    def _scores(
-        self,
-        source: PointCloud,
-        target: PointCloud,
-        found: Match,
-        pose: tuple[Motion, Scalar],
-        spacing: Scalar,
-    ) -> tuple[Score, Scalar]:
-        """Of the source by its match, and the overlap both ways."""
-        T, scale = pose
-        own = scale * median_spacing(source.points, source.mask)
-        spacing = jnp.maximum(spacing, own)
-        there = score_match(found, spacing)
-        back = self._score_of_target(
-            source, target, lax.stop_gradient(T), scale, spacing
-        )
-        return there, mutual_overlap(there, back)
 
-    def _score_of_target(
-        self,
-        source: PointCloud,
-        target: PointCloud,
-        T: Motion,
-        scale: Scalar,
-        spacing: Scalar,
-    ) -> Score:
-        """Of the target on the source."""
-        # Few queries, far apart: comparing all pairs is quicker than building a tree.
-        points = lax.stop_gradient(scale) * source.points
-        source = PointCloud(points, source.normals, source.mask)
-        index = BruteForce.build(source.points, source.mask)
-        problem = Problem.of(target, source, index)
-        rows, use = spread_rows(target.mask, _SCORED_POINTS)
-        some = problem.of_rows(rows)
-        some = eqx.tree_at(lambda p: p.source_mask, some, use)
-        return score(some, lie.inverse(T), spacing)
+def _evidence(
+    source: PointCloud, target: PointCloud, T: Motion, scale: Scalar
+) -> Evidence:
+    """Of the source times a scale at a pose."""
+    source, target, T, scale = lax.stop_gradient((source, target, T, scale))
+    source = eqx.tree_at(lambda c: c.points, source, scale * source.points)
+    return Witness.of_some(source, target).of_pose(T)
 
 
 def _status(
     T: Motion,
     status: Int[Array, ""],
     free: Bool[Array, ""],
-    there: Score,
+    evidence: Evidence,
     worse: Bool[Array, ""],
 ) -> Int[Array, ""]:
     """Of the answer `T`, from that of the loop; the most serious last."""
     status = jnp.where(free, Status.DEGENERATE, status)
-    status = jnp.where(there.fitness > 0, status, Status.LOW_OVERLAP)
+    status = jnp.where(
+        evidence.log_evidence >= _LEAST_EVIDENCE, status, Status.LOW_OVERLAP
+    )
     status = jnp.where(worse, Status.DIVERGED, status)
     status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
     return status.astype(jnp.int32)

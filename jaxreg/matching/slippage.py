@@ -4,11 +4,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxreg._core.typing import Motion, Motions, Scalar
+from jaxreg._core.typing import Motions
 from jaxreg.geometry import lie
-from jaxreg.matching.problem import Match, Problem, match
+from jaxreg.matching.problem import Match
 from jaxreg.matching.residuals import PointToPlane, PointToPoint
-from jaxreg.matching.score import agreeing
 
 
 # Planes that the gentlest motion by one radian, or radius, moves less than this many
@@ -62,20 +61,6 @@ class Grip(eqx.Module):
         turn = lie.rotation(lie.identity(d, middle.dtype, batch))
         H = self.seen_from(lie.compose(turn, -middle)).H / count[..., None, None]
         return (self.count > 0) & _exceeds(H, _HELD**2)
-
-
-def can_slip(
-    problem: Problem, T_target_source: Motion, spacing: Scalar
-) -> Bool[Array, ""]:
-    """Whether some motion leaves the agreeing surfaces nearly in place.
-
-    Args:
-        problem: in frames whose unit is the radius of the clouds.
-        T_target_source: the pose.
-        spacing: distance between samples of the coarser cloud.
-    """
-    found = match(problem, T_target_source)
-    return ~Grip.of(found, found.rotated, agreeing(found, spacing)).holds
 
 
 def _exceeds(H: Float[Array, "*b k k"], least: float) -> Bool[Array, "*b"]:

@@ -12,13 +12,17 @@ from jaxreg.graph import PoseGraph
 from jaxreg.multiview.find_slipping import slipping
 from jaxreg.multiview.find_turnable import turnable
 from jaxreg.multiview.hold_poses import Held
-from jaxreg.multiview.method import min_overlap
-from jaxreg.multiview.place import Placement, displacement, place
+from jaxreg.multiview.method import min_log_evidence
+from jaxreg.multiview.place import Placement, displacement, place, prior_weight
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.registrar import AbstractRegistrar
+
+
+# Poses that other pairs vouch for need less evidence of their own: odds of e^2.
+_VOUCHED = 2.0
 
 
 def finish(
@@ -37,14 +41,14 @@ def finish(
         motions: of pairs, in the scans' centred frames; some may be padding.
         hold: old frames that stay, or None.
     """
-    least = jnp.asarray(min_overlap(method), scans.radius.dtype)
+    least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
     placement = place(motions, scans.num_scans, averaging, least)
     mode, turns = placement.mode, turnable(motions, placement)
-    placement = refine(scans, placement, averaging, least / 2)
+    placement = refine(scans, placement, averaging, least - _VOUCHED)
     if hold is None:
         free = turns | slipping(scans, placement, least)
         return _solution(scans, motions, mode, placement, free, least)
-    placement = hold.place(scans, placement, averaging, least / 2)
+    placement = hold.place(scans, placement, averaging, least - _VOUCHED)
     free = (turns | slipping(scans, placement, least)) & ~hold.held
     solution = _solution(scans, motions, mode, placement, free, least)
     return hold.in_world(solution)
@@ -63,7 +67,7 @@ def _solution(
     found = motions.in_input_frames(scans)
     one = found.of_modes(mode)
     overlap, T_i_j = one.overlap[:, 0], one.T_i_j[:, 0]
-    weight = jnp.where(overlap >= least, overlap, 0)
+    weight = prior_weight(one, least)
     real = motions.pairs[:, 0] != motions.pairs[:, 1]
     graph = PoseGraph(found.pairs, T_i_j, weight, real, None, scans.num_scans)
     component, placed = placement.component, placement.placed

@@ -14,24 +14,24 @@ from jaxtyping import Array, Bool, Int
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
 from jaxreg.graph.trees import components
-from jaxreg.matching import Grip, Problem, agreeing, match
+from jaxreg.matching import Grip
 from jaxreg.multiview.place import Placement, in_main_body
 from jaxreg.multiview.prepare import PreparedScans
 
 
 @eqx.filter_jit
 def slipping(
-    scans: PreparedScans, placement: Placement, min_overlap: Scalar
+    scans: PreparedScans, placement: Placement, least: Scalar
 ) -> Bool[Array, " v"]:
     """`(v,)` scans that can move along the main body of their part.
 
     Args:
         scans: prepared scans.
         placement: their final poses.
-        min_overlap: of the pairs that count.
+        least: log evidence of the pairs that count.
     """
     pairs = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
-    body = _bodies(pairs, _grips(scans, placement, pairs, min_overlap), scans.num_scans)
+    body = _bodies(pairs, _grips(scans, placement, pairs, least), scans.num_scans)
     return ~in_main_body(body, placement.part)
 
 
@@ -39,21 +39,19 @@ def _grips(
     scans: PreparedScans,
     placement: Placement,
     pairs: Int[Array, "e 2"],
-    min_overlap: Scalar,
+    least: Scalar,
 ) -> Grip:
-    """Of every pair that overlaps, in the world's frame; nothing of the others."""
+    """Of every pair that is likely, in the world's frame; nothing of the others."""
     T_world_i = placement.T_world_i
 
     def one(pair: Array) -> Grip:
         i, j = pair
         T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
-        problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
-        found = match(problem, T_i_j)
-        share = agreeing(found, scans.coarsest)
-        enough = jnp.sum(share) >= min_overlap * jnp.sum(found.mask)
-        use = enough & placement.together(i, j)
-        points = found.rotated + lie.translation(T_i_j)[:, None]
-        return Grip.of(found, points, share & use).seen_from(T_world_i[i])
+        witness = scans.witness(i, j)
+        found = witness.of_pose(T_i_j)
+        use = (found.log_evidence >= least) & placement.together(i, j)
+        grip = jax.tree.map(lambda x: jnp.where(use, x, 0), found.grip)
+        return grip.seen_from(T_world_i[i])
 
     return lax.map(one, pairs)
 

@@ -1,6 +1,6 @@
 """Which scans could as well lie otherwise: on symmetric objects, by a finite turn.
 
-A pair of which another mode overlaps as much as the best settles nothing. Pairs that
+A pair of which another mode is as likely as the best settles nothing. Pairs that
 are settled make bodies; scans that only the others join to them may be elsewhere.
 """
 
@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool
 from jaxreg.graph.trees import components
 from jaxreg.multiview.place import Placement, in_main_body, joins
 from jaxreg.multiview.relative_motions import RelativeMotions
-from jaxreg.particle.conclude import RIVAL_OVERLAP
+from jaxreg.particle.conclude import RIVAL_MARGIN
 
 
 @eqx.filter_jit
@@ -22,8 +22,8 @@ def turnable(motions: RelativeMotions, placement: Placement) -> Bool[Array, " v"
         motions: modes of the pairs.
         placement: what was made of them.
     """
-    best = motions.overlap[:, :1]
-    rival = jnp.any(motions.overlap[:, 1:] > RIVAL_OVERLAP * best, axis=1)
+    best = motions.log_evidence[:, :1]
+    rival = jnp.any(motions.log_evidence[:, 1:] > best - RIVAL_MARGIN, axis=1)
     settled = joins(placement.edge_weight) & ~rival
     part = placement.part
     body = components(motions.pairs, settled.astype(best.dtype), part.shape[0])

@@ -2,7 +2,7 @@
 
 A scanner that moves on moves much as it did a scan ago, so a descent from that motion
 finds most pairs of a sequence in a fraction of a search. What it finds is trusted at
-once only if it overlaps by so much as no chance does; else it competes with the search.
+once only if it is as likely as no chance is; else it competes with the search.
 """
 
 import equinox as eqx
@@ -14,15 +14,16 @@ from jaxtyping import Array, Float, Int
 from jaxreg._core.arrays import cast_floats
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
-from jaxreg.matching import PlaneToPlane, Problem, mutual_overlap, score_both_ways
+from jaxreg.matching import NO_EVIDENCE, PlaneToPlane, Problem
 from jaxreg.multiview.method import follower
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.registrar import AbstractRegistrar
 
 
-#: Overlap from which no search competes with a motion.
-SURE = 0.5
+#: Log evidence from which no search competes with a motion: of 140 pairs of scans that
+#: do not overlap none had as much.
+SURE = 4.0
 # Steps from the first kernel width of the search to the sample spacing, and there in
 # the metric of both surfaces.
 _STEPS, _POLISH = 24, 8
@@ -43,19 +44,19 @@ def descended(
 
     def one(row: tuple[Array, Array]) -> RelativeMotions:
         (i, j), T = row
-        clouds = scans.cloud(j), scans.cloud(i), scans.table(j), scans.table(i)
-        problem = Problem.of(clouds[0], clouds[1], clouds[3])
+        problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
         spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
         widths = jnp.geomspace(widest, 0.5 * spacing, _STEPS).astype(dtype)
         T = lie.orthonormalise(coarse.repeat(problem, T, widths))
-        there, back = score_both_ways(*clouds, T[None], jnp.ones(1, bool), spacing)
+        evidence = scans.witness(i, j).of_pose(T)
         T = fine.repeat(problem, T, jnp.full(_POLISH, 0.5 * spacing, dtype))
         sound = scans.usable[i] & scans.usable[j] & jnp.all(jnp.isfinite(T))
         return RelativeMotions(
             row[0],
             jnp.where(sound, lie.orthonormalise(T), jnp.eye(len(T), dtype=dtype))[None],
-            jnp.where(sound, mutual_overlap(there, back), 0),
-            there.inlier_rmse,
+            jnp.where(sound, evidence.overlap, 0)[None],
+            jnp.where(sound, evidence.log_evidence, NO_EVIDENCE)[None],
+            evidence.inlier_rmse[None],
         )
 
     return lax.map(one, (pairs, T_i_j))

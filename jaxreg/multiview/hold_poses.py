@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.geometry import lie
+from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.place import Placement, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.refine import measured, wide_unless_given
@@ -50,7 +51,7 @@ class Held(eqx.Module):
         scans: PreparedScans,
         found: Placement,
         averaging: AbstractAverager | None,
-        min_overlap: Scalar,
+        least: Scalar,
     ) -> Placement:
         """The others beside those that stay.
 
@@ -58,13 +59,13 @@ class Held(eqx.Module):
             scans: prepared scans.
             found: where all of them lie, none held.
             averaging: as in `place`.
-            min_overlap: of the pairs that count.
+            least: log evidence of the pairs that count.
         """
         before = _brought(self, scans, found)
-        motions = measured(scans, before, min_overlap, exact=True)
+        motions = measured(scans, before, least, exact=True)
         num_nodes = 1 + int(np.max(np.asarray(self.node)))
         motions = _contracted(self, before, motions)
-        nodes = place(motions, num_nodes, wide_unless_given(averaging), min_overlap)
+        nodes = place(motions, num_nodes, wide_unless_given(averaging), least)
         return _expanded(self, before, nodes)
 
     def in_world(self, solution: ReconstructionSolution) -> ReconstructionSolution:
@@ -112,7 +113,8 @@ def _contracted(
     return RelativeMotions(
         hold.node[motions.pairs],
         T[i][:, None] @ motions.T_i_j @ lie.inverse(T[j])[:, None],
-        jnp.where(within[:, None], 0, motions.overlap),
+        motions.overlap,
+        jnp.where(within[:, None], NO_EVIDENCE, motions.log_evidence),
         motions.inlier_rmse,
     )
 

@@ -18,9 +18,9 @@ from jaxreg.robust import GemanMcClure
 
 # Modes of a pair that are kept; most pairs have no second one.
 _MOST_MODES = 4
-# Of methods that do not say: the least overlap that is trusted, and the kernel width
+# Of methods that do not say: the least evidence that is believed, and the kernel width
 # of the first step, in radii, those of `ParticleFilter()`.
-_MIN_OVERLAP, _WIDEST = 0.1, 0.3
+_MIN_LOG_EVIDENCE, _WIDEST = 1.0, 0.3
 
 
 def num_kept(method: AbstractRegistrar) -> int:
@@ -30,11 +30,11 @@ def num_kept(method: AbstractRegistrar) -> int:
     return 1
 
 
-def min_overlap(method: AbstractRegistrar) -> Array | float:
-    """The least overlap of a pair that is trusted."""
+def min_log_evidence(method: AbstractRegistrar) -> Array | float:
+    """The least evidence of a pair that is believed on its own."""
     if isinstance(method, AbstractIndexedRegistrar):
-        return method.min_overlap
-    return _MIN_OVERLAP
+        return method.min_log_evidence
+    return _MIN_LOG_EVIDENCE
 
 
 def index_of(method: AbstractRegistrar, cloud: PointCloud) -> AbstractIndex:

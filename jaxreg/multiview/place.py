@@ -1,5 +1,7 @@
 """From relative motions to poses: which pairs to trust, and which scans they place."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,9 +29,11 @@ _MIN_TRUST = 0.1
 _AGREES = 0.15
 # Averages: of the best modes, then of those that agree with the poses from these.
 _PASSES = 2
-# Pairs of overlap above this many times the least one join scans on their own; weaker
-# ones must be confirmed by a second pair between the same parts.
-_STRONG = 2.0
+# Pairs that `register` would not believe may count where others confirm them: those
+# whose log evidence is at most so much below.
+_CONFIRMABLE = 1.0
+# The weight of motions of no consequence.
+_HUNG = 0.1
 
 
 class Placement(eqx.Module):
@@ -82,9 +86,9 @@ def place(
     motions: RelativeMotions,
     num_scans: int,
     averaging: AbstractAverager | None,
-    min_overlap: Scalar,
+    least: Scalar,
 ) -> Placement:
-    """Averages the pairs that overlap; the world is the frame of the root.
+    """Averages the pairs that are likely; the world is the frame of the root.
 
     Each pair is a mixture of its modes, of which one at a time counts: the best, and
     once poses are known, the one that agrees with them, with its own overlap (a
@@ -92,18 +96,23 @@ def place(
 
     The root is the scan of lowest number in the largest connected set of scans. The
     other sets of two and more are averaged with it, each hung on it by one motion of no
-    consequence. Overlap is evidence of its own, so averaging starts from the spanning
-    tree of largest overlap, and stays there where no pairs agree with each other.
+    consequence. Averaging starts from the spanning tree of the largest weights
+    (`prior_weight`), and stays there where no pairs agree with each other.
+
+    A pair joins scans on its own if its log evidence exceeds `least` by log(v - 1):
+    each scan is tried against as many others, so the rate of false alarms of one trial
+    is divided by them. Others join parts that a second pair, or a loop of three parts,
+    confirms.
     """
     if averaging is None:
         averaging = Correntropy(initialiser=SpanningTree())
     best = jnp.zeros(len(motions.pairs), jnp.int32)
     if motions.num_modes == 1:
-        return _averaged(motions, best, num_scans, averaging, min_overlap)
+        return _averaged(motions, best, num_scans, averaging, least)
 
     def again(mode: Array, _: None) -> tuple[Array, Placement]:
-        found = _averaged(motions, mode, num_scans, averaging, min_overlap)
-        return _agreeing(motions, found, min_overlap), found
+        found = _averaged(motions, mode, num_scans, averaging, least)
+        return _agreeing(motions, found, least), found
 
     _, passes = lax.scan(again, best, None, length=_PASSES)
     return jax.tree.map(lambda x: x[-1], passes)
@@ -114,12 +123,12 @@ def _averaged(
     mode: Int[Array, " e"],
     num_scans: int,
     averaging: AbstractAverager,
-    min_overlap: Scalar,
+    least: Scalar,
 ) -> Placement:
     """By one mode of each pair."""
     pairs, one = motions.pairs, motions.of_modes(mode)
-    T_i_j, overlap = one.T_i_j[:, 0], one.overlap[:, 0]
-    trusted = jnp.where(overlap >= min_overlap, overlap, 0)
+    T_i_j, log_evidence = one.T_i_j[:, 0], one.log_evidence[:, 0]
+    trusted = prior_weight(one, least)
     label = components(pairs, trusted, num_scans)
     size = part_sizes(label)
     root = jnp.argmax(size).astype(jnp.int32)
@@ -128,25 +137,24 @@ def _averaged(
     # Averaging fixes frame 0: swap the root's number with 0.
     swap = ids.at[root].set(0).at[0].set(root)
     graph = PoseGraph(swap[pairs], T_i_j, trusted, trusted > 0, None, num_scans)
-    solution = average(_with_hung(graph, hung[swap], min_overlap), averaging)
+    solution = average(_with_hung(graph, hung[swap]), averaging)
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
     agreed = jnp.where(joins(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
-    # Nothing could confirm the only pair of two scans: it is trusted as `register` is.
-    strong = (_STRONG if num_scans > 2 else 1) * min_overlap
+    strong = log_evidence >= least + math.log(max(num_scans - 1, 1))
     part = _confirmed_components(pairs, agreed, num_scans, strong)
     T_world_i, status, trace = solution.T_world_i[swap], solution.status, solution.trace
     return Placement(T_world_i, part, edge_weight, mode, status, trace)
 
 
 def _agreeing(
-    motions: RelativeMotions, found: Placement, min_overlap: Scalar
+    motions: RelativeMotions, found: Placement, least: Scalar
 ) -> Int[Array, " e"]:
     """The first of each pair's modes that agrees with the poses; if none, the best."""
     i, j = motions.pairs.T
     T_i_j = lie.inverse(found.T_world_i[i]) @ found.T_world_i[j]
     turn, shift = displacement(T_i_j[:, None], motions.T_i_j)
-    agrees = (turn < _AGREES) & (shift < _AGREES) & (motions.overlap >= min_overlap)
+    agrees = (turn < _AGREES) & (shift < _AGREES) & likely(motions, least)
     agrees = agrees & found.together(i, j)[:, None]
     return jnp.argmax(agrees, axis=1).astype(jnp.int32)
 
@@ -172,7 +180,7 @@ def in_main_body(body: Int[Array, " v"], part: Int[Array, " v"]) -> Bool[Array, 
     return body == body[largest]
 
 
-def _with_hung(graph: PoseGraph, hung: Bool[Array, " v"], weight: Scalar) -> PoseGraph:
+def _with_hung(graph: PoseGraph, hung: Bool[Array, " v"]) -> PoseGraph:
     """With a motion from frame 0 to each frame of `hung`: none contradicts it."""
     num, D = hung.shape[0], graph.T_i_j.shape[-1]
     ids = jnp.where(hung, jnp.arange(num, dtype=jnp.int32), 0)
@@ -180,11 +188,27 @@ def _with_hung(graph: PoseGraph, hung: Bool[Array, " v"], weight: Scalar) -> Pos
     return PoseGraph(
         jnp.concatenate([graph.edges, jnp.stack([jnp.zeros_like(ids), ids], axis=1)]),
         jnp.concatenate([graph.T_i_j, eye]),
-        jnp.concatenate([graph.weight, jnp.where(hung, weight, 0)]),
+        jnp.concatenate(
+            [graph.weight, jnp.where(hung, _HUNG, 0).astype(graph.weight.dtype)]
+        ),
         jnp.concatenate([graph.mask, hung]),
         None,
         num,
     )
+
+
+def likely(motions: RelativeMotions, least: Scalar) -> Bool[Array, "e m"]:
+    """Which modes count where others confirm them."""
+    return motions.log_evidence >= least - _CONFIRMABLE
+
+
+def prior_weight(one: RelativeMotions, least: Scalar) -> Float[Array, " e"]:
+    """Of pairs of one mode: overlap times probability, zero of those not likely.
+
+    The larger the overlap, the more accurate the motion.
+    """
+    weight = one.overlap * jax.nn.sigmoid(one.log_evidence)
+    return jnp.where(likely(one, least), weight, 0)[:, 0]
 
 
 def joins(edge_weight: Float[Array, " e"]) -> Bool[Array, " e"]:
@@ -194,15 +218,28 @@ def joins(edge_weight: Float[Array, " e"]) -> Bool[Array, " e"]:
 
 def _confirmed_components(
     pairs: Int[Array, "e 2"],
-    overlap: Float[Array, " e"],
+    weight: Float[Array, " e"],
     num_scans: int,
-    strong: Scalar,
+    strong: Bool[Array, " e"],
 ) -> Int[Array, " v"]:
-    """Components joined by strong pairs, or by two or more weak ones that agree."""
-    core = components(pairs, jnp.where(overlap >= strong, overlap, 0), num_scans)
-    i, j = core[pairs[:, 0]], core[pairs[:, 1]]
-    low, high = jnp.minimum(i, j), jnp.maximum(i, j)
-    count = jnp.zeros((num_scans, num_scans), jnp.int32)
-    count = count.at[low, high].add((overlap > 0).astype(jnp.int32))
-    confirmed = (low == high) | (count[low, high] >= 2)
-    return components(pairs, jnp.where(confirmed, overlap, 0), num_scans)
+    """Components joined by strong pairs, or by pairs that agree and are confirmed.
+
+    Pairs confirm each other that join the same two parts, or three parts in a loop:
+    that wrong ones agree with the poses by chance is far less likely than any one of
+    them being wrong. What they join is one part from then on.
+    """
+
+    def joined(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        part, _ = state
+        i, j = part[pairs[:, 0]], part[pairs[:, 1]]
+        count = jnp.zeros((num_scans, num_scans), weight.dtype)
+        one = ((weight > 0) & (i != j)).astype(weight.dtype)
+        count = count.at[i, j].add(one).at[j, i].add(one)
+        beside = (count > 0).astype(weight.dtype)
+        loop = jnp.matmul(beside, beside, precision=lax.Precision.HIGHEST)
+        confirmed = (i == j) | (count[i, j] >= 2) | (loop[i, j] > 0)
+        new = components(pairs, jnp.where(confirmed, weight, 0), num_scans)
+        return new, jnp.any(new != part)
+
+    core = components(pairs, jnp.where(strong, weight, 0), num_scans)
+    return lax.while_loop(lambda s: s[1], joined, (core, jnp.asarray(True)))[0]

@@ -10,8 +10,9 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Motions, Scalar
 from jaxreg.cloud import Frames, PointCloud, centroid, median_spacing, rms_radius
 from jaxreg.geometry import lie
+from jaxreg.matching import Witness
 from jaxreg.multiview.method import index_of
-from jaxreg.neighbours import AbstractIndex
+from jaxreg.neighbours import AbstractIndex, index_within
 from jaxreg.registrar import AbstractRegistrar
 
 
@@ -25,7 +26,8 @@ class PreparedScans(eqx.Module):
     Attributes:
         clouds: `(v, n, d)` thinned points with normals; the unit is `radius`. With what
             was seen from the viewpoints, where these are given.
-        tables: their indexes.
+        tables: their indexes, of the method's kind.
+        exact: indexes that miss no near point, for the evidence.
         mean: `(v, d)` centroid of each scan in its input frame.
         radius: the median root mean square radius of the scans, in the input's unit.
         spacing: `(v,)` distance between thinned points, in units of `radius`.
@@ -37,6 +39,7 @@ class PreparedScans(eqx.Module):
 
     clouds: PointCloud
     tables: AbstractIndex
+    exact: AbstractIndex
     mean: Float[Array, "v d"]
     radius: Scalar
     spacing: Float[Array, " v"]
@@ -65,6 +68,12 @@ class PreparedScans(eqx.Module):
     def table(self, i: Int[Array, ""]) -> AbstractIndex:
         """One scan's index."""
         return jax.tree.map(lambda x: x[i], self.tables)
+
+    def witness(self, i: Int[Array, ""], j: Int[Array, ""]) -> Witness:
+        """Who tells how likely motions of scan j into scan i are."""
+        clouds = self.cloud(j), self.cloud(i)
+        near = (jax.tree.map(lambda x, k=k: x[k], self.exact) for k in (j, i))
+        return Witness.of(*clouds, *near)
 
     def frames(self, i: Int[Array, ""], j: Int[Array, ""]) -> Frames:
         """Those of scan j as the source and scan i as the target."""
@@ -110,13 +119,15 @@ def prepare_scan(
     points: Float[Array, "n d"],
     mask: Bool[Array, " n"],
     radius: Scalar,
-) -> tuple[PointCloud, AbstractIndex, Float[Array, " d"], Scalar]:
-    """One scan: cloud, table, centroid and spacing."""
+) -> tuple[PointCloud, AbstractIndex, AbstractIndex, Float[Array, " d"], Scalar]:
+    """One scan: cloud, table, exact index, centroid and spacing."""
     mean = centroid(points, mask)
     method = method.in_frames(Frames(mean, mean, radius))
-    cloud = method.prepare((points - mean) / radius, mask)
+    cloud = method.prepare((points - mean) / radius, mask).with_spacing()
     table = index_of(method, cloud)
-    return cloud, table, mean, median_spacing(cloud.points, cloud.mask)
+    spacing = median_spacing(cloud.points, cloud.mask)
+    exact = index_within(cloud.points, cloud.mask, spacing)
+    return cloud, table, exact, mean, spacing
 
 
 @eqx.filter_jit
@@ -129,14 +140,14 @@ def prepare_scans(
     """Prepares all scans, one after another; NaN stands for an unknown viewpoint."""
     points, mask, dropped = clean(points, mask)
     radius = common_radius(points, mask)
-    clouds, tables, mean, spacing = lax.map(
+    clouds, tables, exact, mean, spacing = lax.map(
         lambda scan: prepare_scan(method, scan[0], scan[1], radius), (points, mask)
     )
     if viewpoints is not None:
         eyes = (viewpoints - mean) / radius
         clouds = lax.map(lambda scan: scan[0].seen_from(scan[1]), (clouds, eyes))
     fault = _fault(clouds, jax.vmap(rms_radius)(points, mask) / radius, spacing)
-    return PreparedScans(clouds, tables, mean, radius, spacing, fault, dropped)
+    return PreparedScans(clouds, tables, exact, mean, radius, spacing, fault, dropped)
 
 
 def _fault(

@@ -18,7 +18,7 @@ from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
-from jaxreg.matching import PlaneToPlane, Problem, mutual_overlap, score
+from jaxreg.matching import NO_EVIDENCE, PlaneToPlane, Problem
 from jaxreg.multiview.place import Placement, part_sizes, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -35,7 +35,7 @@ def refine(
     scans: PreparedScans,
     placement: Placement,
     averaging: AbstractAverager | None,
-    min_overlap: Scalar,
+    least: Scalar,
 ) -> Placement:
     """Poses from all pairs of placed scans that overlap, measured anew.
 
@@ -43,7 +43,7 @@ def refine(
         scans: prepared scans.
         placement: poses of the centred frames, and which scans hang together.
         averaging: None for `MCC`.
-        min_overlap: of the pairs that count.
+        least: log evidence of the pairs that count.
 
     Returns:
         The placement by these pairs. Scans that no pair holds any more keep their
@@ -51,8 +51,8 @@ def refine(
     """
     averaging = wide_unless_given(averaging)
     for exact in (False, True):
-        motions = measured(scans, placement, min_overlap, exact=exact)
-        again = place(motions, scans.num_scans, averaging, min_overlap)
+        motions = measured(scans, placement, least, exact=exact)
+        again = place(motions, scans.num_scans, averaging, least)
         placement = _updated(placement, again)
     return placement
 
@@ -86,7 +86,7 @@ def _updated(before: Placement, after: Placement) -> Placement:
 
 @eqx.filter_jit
 def measured(
-    scans: PreparedScans, placement: Placement, min_overlap: Scalar, *, exact: bool
+    scans: PreparedScans, placement: Placement, least: Scalar, *, exact: bool
 ) -> RelativeMotions:
     """The motion and overlap of every pair of a part near the present poses, m = 1."""
     T_world_i, alone = placement.T_world_i, part_sizes(placement.part) == 1
@@ -102,20 +102,18 @@ def measured(
         T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
         return lie.orthonormalise(optimiser.repeat(problem, T_i_j, widths))
 
-    def one(pair: Array) -> tuple[Motion, Scalar]:
+    def one(pair: Array) -> RelativeMotions:
         i, j = pair
         T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
-        there = score(_problem(scans, i, j), T_i_j, spacing)
-        back = score(_problem(scans, j, i), lie.inverse(T_i_j), spacing)
-        overlap = mutual_overlap(there, back)
-        overlap = jnp.where(placement.together(i, j), overlap, 0)
-        T_i_j = lax.cond(overlap >= min_overlap, measured, lambda _: T_i_j, pair)
-        return T_i_j, overlap
+        found, together = scans.witness(i, j).of_pose(T_i_j), placement.together(i, j)
+        told = jnp.where(together, found.log_evidence, NO_EVIDENCE)
+        T_i_j = lax.cond(told >= least, measured, lambda _: T_i_j, pair)
+        return RelativeMotions(
+            pair, T_i_j[None], found.overlap[None], told[None], found.inlier_rmse[None]
+        )
 
     pairs = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
-    T_i_j, overlap = lax.map(one, pairs)
-    T_i_j, overlap = T_i_j[:, None], overlap[:, None]
-    return RelativeMotions(pairs, T_i_j, overlap, jnp.zeros_like(overlap))
+    return lax.map(one, pairs)
 
 
 def _problem(scans: PreparedScans, i: Array, j: Array, exact: bool = False) -> Problem:

@@ -9,14 +9,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxreg._core.typing import Key, Progress
+from jaxreg._core.typing import Key, Progress, Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.threads import map_in_threads
 from jaxreg.geometry import lie
-from jaxreg.matching import Problem, score
+from jaxreg.matching import Match, Problem, match
 from jaxreg.multiview.choose_pairs import Order, first_pairs, most_pairs, next_pairs
 from jaxreg.multiview.follow_sequence import SURE, descended_in_input_frames
-from jaxreg.multiview.method import min_overlap, num_kept
+from jaxreg.multiview.method import min_log_evidence, num_kept
 from jaxreg.multiview.place import Placement, joins, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
@@ -27,7 +27,8 @@ from jaxreg.registrar import AbstractRegistrar
 OnPairs = Callable[[RelativeMotions], None]
 
 _PAIRS_PER_BATCH, _THREADS = 4, 2
-# Poses of a chain drift: surfaces this many spacings apart may still be one.
+# Poses of a chain drift: points this many spacings apart, one spacing over or under the
+# other's plane, may still be of one place.
 _DRIFT = 6.0
 
 
@@ -145,7 +146,7 @@ class Rounds:
             if guess is None:
                 continue
             one = descended_in_input_frames(self.method, scans, (i, j), guess)
-            if float(one.overlap[0, 0]) < SURE:
+            if float(one.log_evidence[0, 0]) < SURE:
                 self.rivals[i, j] = one
                 continue
             # Known pairs are followed, too: a run taken up again goes the same way.
@@ -177,9 +178,9 @@ def _prospects(
     motions: RelativeMotions,
 ) -> tuple[Placement, Float[Array, "v v"]]:
     """Present poses, and the share of scan j that is near scan i by them, i < j."""
-    least = jnp.asarray(min_overlap(method), scans.radius.dtype)
+    least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
     found = place(motions, scans.num_scans, averaging, least)
-    T, spacing = found.T_world_i, _DRIFT * scans.coarsest
+    T = found.T_world_i
 
     def share(pair: Array) -> Array:
         i, j = pair
@@ -187,10 +188,19 @@ def _prospects(
         problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
         return lax.cond(
             found.together(i, j),
-            lambda: score(problem, T_i_j, spacing).fitness,
-            lambda: jnp.zeros_like(spacing),
+            lambda: _near(match(problem, T_i_j), scans.coarsest),
+            lambda: jnp.zeros_like(scans.coarsest),
         )
 
     i, j = jnp.triu_indices(scans.num_scans, 1)
     shares = lax.map(share, jnp.stack([i, j], axis=1))
     return found, jnp.zeros((scans.num_scans,) * 2, T.dtype).at[i, j].set(shares)
+
+
+def _near(found: Match, spacing: Scalar) -> Scalar:
+    """The share of the points that may be of the other surface."""
+    flat = jnp.any(found.normal != 0, axis=0)
+    near = (found.sq_residual < (_DRIFT * spacing) ** 2) & found.mask
+    near = near & (~flat | (jnp.abs(found.plane_residual) < spacing))
+    share = jnp.sum(near) / jnp.maximum(jnp.sum(found.mask), 1)
+    return share.astype(spacing.dtype)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
+from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.method import num_kept, solve
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.registrar import AbstractRegistrar
@@ -27,12 +28,14 @@ class RelativeMotions(BriefModule):
         pairs: `(e, 2)` int32, the scans i < j.
         T_i_j: `(e, m, d+1, d+1)`.
         overlap: `(e, m)` see `RegistrationSolution`; 0 where there is no such mode.
+        log_evidence: `(e, m)` see there; `NO_EVIDENCE` where there is no such mode.
         inlier_rmse: `(e, m)` in the unit of the motions.
     """
 
     pairs: Int[Array, "*e 2"]
     T_i_j: Float[Array, "*e m D D"]
     overlap: Float[Array, "*e m"]
+    log_evidence: Float[Array, "*e m"]
     inlier_rmse: Float[Array, "*e m"]
 
     @property
@@ -43,7 +46,7 @@ class RelativeMotions(BriefModule):
     def of_modes(self, mode: Int[Array, " e"]) -> "RelativeMotions":
         """One mode of each pair, m = 1."""
         e = jnp.arange(len(mode))
-        parts = self.T_i_j, self.overlap, self.inlier_rmse
+        parts = self.T_i_j, self.overlap, self.log_evidence, self.inlier_rmse
         return RelativeMotions(self.pairs, *(x[e, mode][:, None] for x in parts))
 
     @eqx.filter_jit
@@ -52,10 +55,11 @@ class RelativeMotions(BriefModule):
         return jax.tree.map(lambda x: x[rows], self)
 
     def or_better(self, others: list["RelativeMotions | None"]) -> "RelativeMotions":
-        """Where there is another motion of a pair that overlaps more, that one."""
+        """Where there is a likelier motion of a pair, that one."""
         out = self
         for k, other in enumerate(others):
-            if other is None or float(other.overlap[0, 0]) <= float(self.overlap[k, 0]):
+            own = float(self.log_evidence[k, 0])
+            if other is None or float(other.log_evidence[0, 0]) <= own:
                 continue
             other = other.with_modes(self.num_modes)
             out = jax.tree.map(lambda x, y, k=k: x.at[k].set(y[0]), out, other)
@@ -65,11 +69,17 @@ class RelativeMotions(BriefModule):
         """With the best so many modes, some of which may not overlap."""
         more = max(num - self.num_modes, 0)
 
-        def of(x: Array) -> Array:
-            return jnp.pad(x, [(0, 0), (0, more)] + [(0, 0)] * (x.ndim - 2))[:, :num]
+        def of(x: Array, fill: float = 0) -> Array:
+            rows = [(0, 0), (0, more)] + [(0, 0)] * (x.ndim - 2)
+            return jnp.pad(x, rows, constant_values=fill)[:, :num]
 
-        parts = self.T_i_j, self.overlap, self.inlier_rmse
-        return RelativeMotions(self.pairs, *map(of, parts))
+        return RelativeMotions(
+            self.pairs,
+            of(self.T_i_j),
+            of(self.overlap),
+            of(self.log_evidence, NO_EVIDENCE),
+            of(self.inlier_rmse),
+        )
 
     def padded(self, num: int) -> "RelativeMotions":
         """With pairs of scan 0 and itself that do not overlap, to so many."""
@@ -78,7 +88,10 @@ class RelativeMotions(BriefModule):
         def pad(x: Array) -> Array:
             return jnp.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1))
 
-        return jax.tree.map(pad, self)
+        real = jnp.arange(num)[:, None] < len(self.overlap)
+        out = jax.tree.map(pad, self)
+        told = jnp.where(real, out.log_evidence, NO_EVIDENCE)
+        return eqx.tree_at(lambda m: m.log_evidence, out, told)
 
     @staticmethod
     def joined(some: list["RelativeMotions"]) -> "RelativeMotions":
@@ -90,13 +103,13 @@ class RelativeMotions(BriefModule):
         """From the scans' centred frames and unit."""
         T_i_j = scans.to_input_frames(self.T_i_j, *self._scans())
         rmse = scans.radius * self.inlier_rmse
-        return RelativeMotions(self.pairs, T_i_j, self.overlap, rmse)
+        return RelativeMotions(self.pairs, T_i_j, self.overlap, self.log_evidence, rmse)
 
     def in_centred_frames(self, scans: PreparedScans) -> "RelativeMotions":
         """The other way."""
         T_i_j = scans.to_centred_frames(self.T_i_j, *self._scans())
         rmse = self.inlier_rmse / scans.radius
-        return RelativeMotions(self.pairs, T_i_j, self.overlap, rmse)
+        return RelativeMotions(self.pairs, T_i_j, self.overlap, self.log_evidence, rmse)
 
     def _scans(self) -> tuple[Int[Array, "e m"], Int[Array, "e m"]]:
         """Scans i and j of every mode."""
@@ -137,6 +150,7 @@ def relative_motions(
             pair,
             jnp.where(sound[:, None, None], T, jnp.eye(T.shape[-1], dtype=T.dtype)),
             jnp.where(sound, modes.overlap, 0),
+            jnp.where(sound, modes.log_evidence, NO_EVIDENCE),
             jnp.where(sound, modes.inlier_rmse, 0),
         )
 

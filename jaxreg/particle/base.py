@@ -96,7 +96,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
         check_counts(self, num_points=1, num_modes=1, max_points=1, batch_size=1)
         check_counts(self, refine_steps=0)
         check_positive(self, "width_start", "width_end")
-        check_not_negative(self, "tolerance", "min_overlap")
+        check_not_negative(self, "tolerance")
 
     @abc.abstractmethod
     def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
@@ -183,7 +183,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
             kernel=self.kernel,
             num_modes=self.num_modes,
             refine_steps=self.refine_steps,
-            min_overlap=self.min_overlap,
+            min_log_evidence=self.min_log_evidence,
         )
         return dataclasses.replace(solution, trace=found.trace)
 

@@ -1,4 +1,4 @@
-"""From many measured poses to an answer: modes, refinement, scores, polish, status."""
+"""From many measured poses to an answer: modes, refinement, evidence, status."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -16,16 +16,14 @@ from jaxreg.cloud import PointCloud, levelled, median_spacing
 from jaxreg.geometry import lie
 from jaxreg.local import Curvature, GaussNewton, LocalOptimiser
 from jaxreg.matching import (
+    NO_EVIDENCE,
     PlaneToPlane,
     PointToPlane,
     Problem,
-    Score,
-    can_slip,
+    Witness,
     match,
-    mutual_overlap,
-    score_both_ways,
 )
-from jaxreg.neighbours import AbstractIndex
+from jaxreg.neighbours import AbstractIndex, index_within
 from jaxreg.particle.modes import distinct_modes, first_within
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import Modes, RegistrationSolution
@@ -34,11 +32,11 @@ from jaxreg.robust import AbstractKernel
 
 # Poses nearer than this, in radians and radii, are one mode.
 _APART = 0.3
-#: A second mode is a rival of the first if its overlap is more than this share of the
-#: first's,
-RIVAL_OVERLAP = 0.95
-# or its weight: by chance alone, two standard errors.
-_RIVAL_WEIGHT = 0.13
+#: A second mode is a rival of the first if its log evidence falls short of the first's
+#: by less than this: the first is less than e times likelier.
+RIVAL_MARGIN = 1.0
+# Modes of so much less evidence than the first are not worth the last steps.
+_HOPELESS = 6.0
 # Steps of the most accurate residual, where it is close already.
 _POLISH = 8
 
@@ -60,6 +58,23 @@ class Pair(eqx.Module):
         return Problem.of(self.source, self.target, self.target_index)
 
     @property
+    def exact(self) -> "Pair":
+        """With indexes that miss no near point; tables miss every other."""
+        indexes = on_both(
+            lambda cloud: index_within(
+                cloud.points, cloud.mask, median_spacing(cloud.points, cloud.mask)
+            ),
+            *levelled(self.source, self.target),
+        )
+        return Pair(self.source, self.target, *indexes)
+
+    @property
+    def witness(self) -> Witness:
+        """Who tells how likely poses are."""
+        clouds = self.source, self.target
+        return Witness.of(*clouds, self.source_index, self.target_index)
+
+    @property
     def spacing(self) -> Scalar:
         """Between samples of the coarser cloud."""
         return jnp.maximum(
@@ -68,14 +83,6 @@ class Pair(eqx.Module):
                 *levelled(self.source, self.target),
             )
         )
-
-    def scores(
-        self, T: Float[Array, "q D D"], used: Bool[Array, " q"], spacing: Scalar
-    ) -> tuple[Score, Float[Array, " q"]]:
-        """Of the source on the target at poses in use, and the overlap."""
-        clouds = self.source, self.target, self.source_index, self.target_index
-        there, back = score_both_ways(*clouds, T, used, spacing)
-        return there, mutual_overlap(there, back)
 
 
 def conclude(
@@ -87,7 +94,7 @@ def conclude(
     kernel: AbstractKernel,
     num_modes: int,
     refine_steps: int,
-    min_overlap: Array | float,
+    min_log_evidence: Array | float,
 ) -> RegistrationSolution:
     """The solution of a search.
 
@@ -97,46 +104,55 @@ def conclude(
         num_steps: steps of the local optimiser that led to them.
         finished: whether they had come to rest.
         kernel: of the refinement.
-        num_modes: distinct poses to refine and score.
-        refine_steps: steps on all points; the modes are then ordered by the overlap
-            that they reach. Without, by energy: the answer is the particle of least
-            energy.
-        min_overlap: below this overlap the status is LOW_OVERLAP.
+        num_modes: distinct poses to refine and judge.
+        refine_steps: steps on all points; the modes are then ordered by their
+            evidence. Without, by energy: the answer is the particle of least energy.
+        min_log_evidence: of less the status is LOW_OVERLAP.
     """
     dtype = particles.energy.dtype
     limit = jnp.asarray(_APART, dtype)
     rows, mass = distinct_modes(particles, num_modes, angle=limit, distance=limit)
-    spacing = pair.spacing
+    spacing, exact = pair.spacing, pair.exact
+    witness = exact.witness
     T_modes = particles.T_target_source[rows]
     T_modes, sound = _refined(
         pair.problem, kernel, T_modes, mass > 0, spacing, refine_steps
     )
-    there, overlap = pair.scores(T_modes, sound, spacing)
-    overlap = jnp.where(sound, overlap, -1)
-    order = jnp.argsort(-overlap) if refine_steps else jnp.arange(num_modes)
-    T_modes, mass, overlap, there = jax.tree.map(
-        lambda x: x[order], (T_modes, mass, overlap, there)
+    evidence = witness.of_poses(T_modes, sound)
+    by_evidence = jnp.argsort(-evidence.log_evidence)
+    order = by_evidence if refine_steps else jnp.arange(num_modes)
+    T_modes, mass, sound, evidence = jax.tree.map(
+        lambda x: x[order], (T_modes, mass, sound, evidence)
     )
     # Refinement may lead two of them to one pose.
     first = first_within(T_modes, angle=limit, distance=limit)
-    overlap = jnp.where(first == jnp.arange(num_modes), overlap, -1)
-    weight = _weights(overlap, pair)
+    sound = sound & (first == jnp.arange(num_modes))
+    log_evidence = jnp.where(sound, evidence.log_evidence, NO_EVIDENCE)
+    weight = _weights(log_evidence, sound)
     mass = weight if refine_steps else mass
     steps = _POLISH if refine_steps else 0
     T_modes, curvatures = _polished(
-        pair.problem, kernel, T_modes, overlap >= 0, 0.5 * spacing, steps
+        exact.problem,
+        kernel,
+        T_modes,
+        sound,
+        log_evidence > log_evidence[0] - _HOPELESS,
+        0.5 * spacing,
+        steps,
     )
-    best, curvature = jax.tree.map(lambda x: x[0], (there, curvatures))
-    doubtful = can_slip(pair.problem, T_modes[0], spacing) | _has_rival(overlap, weight)
+    best, curvature = jax.tree.map(lambda x: x[0], (evidence, curvatures))
+    doubtful = ~best.grip.holds | _has_rival(log_evidence)
     finished = finished | (refine_steps > 0)
-    status = _status(overlap[0], doubtful, pair, min_overlap, finished)
+    enough = log_evidence[0] >= min_log_evidence
+    status = _status(sound[0], enough, doubtful, pair, finished)
     return RegistrationSolution(
         T_target_source=T_modes[0],
         status=status,
         fitness=best.fitness,
         inlier_rmse=best.inlier_rmse,
         num_inliers=best.num_inliers,
-        overlap=jnp.maximum(overlap[0], 0),
+        overlap=best.overlap,
+        log_evidence=log_evidence[0],
         num_steps=(num_steps + refine_steps).astype(jnp.int32),
         H=curvature.H,
         b=curvature.b,
@@ -145,38 +161,29 @@ def conclude(
         modes=Modes(
             T_modes,
             mass,
-            there.fitness,
-            jnp.maximum(overlap, 0),
-            there.inlier_rmse,
+            evidence.fitness,
+            jnp.where(sound, evidence.overlap, 0),
+            evidence.inlier_rmse,
+            log_evidence,
             curvatures.covariance,
         ),
     )
 
 
-def _has_rival(
-    overlap: Float[Array, " q"], weight: Float[Array, " q"]
-) -> Bool[Array, ""]:
-    """Whether another mode is about as good as the first."""
-    as_large = overlap[1:] > RIVAL_OVERLAP * overlap[0]
-    return jnp.any(as_large | (weight[1:] > _RIVAL_WEIGHT * weight[0]))
+def _has_rival(log_evidence: Float[Array, " q"]) -> Bool[Array, ""]:
+    """Whether another mode is about as likely as the first."""
+    return jnp.any(log_evidence[1:] > log_evidence[0] - RIVAL_MARGIN)
 
 
-def _weights(overlap: Float[Array, " q"], pair: Pair) -> Float[Array, " q"]:
-    """Shares of the posterior, of modes with the best first.
-
-    By how much a mode's overlap falls short of the best, in the standard error that
-    the difference of two such shares has when both are the same.
-    """
-    best = jnp.clip(overlap[0], 0.1, 0.9)
-    few = jnp.minimum(jnp.sum(pair.source.mask), jnp.sum(pair.target.mask))
-    sq_error = 2 * best * (1 - best) / jnp.maximum(few, 1).astype(best.dtype)
-    short = (overlap[0] - overlap) ** 2 / sq_error
-    weight = jnp.where(overlap >= 0, jnp.exp(-short / 2), 0)
+def _weights(
+    log_evidence: Float[Array, " q"], used: Bool[Array, " q"]
+) -> Float[Array, " q"]:
+    """Shares of the posterior, equal before."""
+    relative = jnp.exp(log_evidence - jnp.max(log_evidence))
     # A mode in use has a weight, though it may underflow.
-    weight = jnp.where(
-        overlap >= 0, jnp.maximum(weight, jnp.finfo(short.dtype).tiny), 0
-    )
-    return weight / jnp.maximum(jnp.sum(weight), jnp.finfo(short.dtype).tiny)
+    tiny = jnp.finfo(relative.dtype).tiny
+    weight = jnp.where(used, jnp.maximum(relative, tiny), 0)
+    return weight / jnp.maximum(jnp.sum(weight), tiny)
 
 
 def _refined(
@@ -207,24 +214,30 @@ def _polished(
     kernel: AbstractKernel,
     T: Float[Array, "q D D"],
     sound: Bool[Array, " q"],
+    hopeful: Bool[Array, " q"],
     width: Scalar,
     num_steps: int,
 ) -> tuple[Float[Array, "q D D"], Curvature]:
     """The last steps, in the metric of both surfaces, and the curvature there.
 
     Three times as accurate as planes of the target alone; but modes are compared
-    before, as wrong ones gain more by it than right ones. What is no mode stays.
+    before, as wrong ones gain more by it than right ones. What is no mode stays, and so
+    do those without hope, which have a curvature only.
     """
     optimiser = LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton())
     optimiser = cast_floats(optimiser, T.dtype)
 
-    def polish(T: Motion) -> tuple[Motion, Curvature]:
-        T = optimiser.repeat(problem, T, jnp.full(num_steps, width))
-        T = lie.orthonormalise(T)
-        return T, Curvature.of(optimiser, problem, T, match(problem, T), width)
+    def polish(T: Motion) -> Motion:
+        return lie.orthonormalise(
+            optimiser.repeat(problem, T, jnp.full(num_steps, width))
+        )
 
-    polished, curvature = _of_used(polish, T, sound)
-    return jnp.where(sound[:, None, None], polished, T), curvature
+    def curvature_at(T: Motion) -> Curvature:
+        return Curvature.of(optimiser, problem, T, match(problem, T), width)
+
+    polished = _of_used(polish, T, sound & hopeful)
+    T = jnp.where((sound & hopeful)[:, None, None], polished, T)
+    return T, _of_used(curvature_at, T, sound)
 
 
 def _of_used(
@@ -242,17 +255,17 @@ def _of_used(
 
 
 def _status(
-    overlap: Float[Array, ""],
+    sound: Bool[Array, ""],
+    enough: Bool[Array, ""],
     doubtful: Bool[Array, ""],
     pair: Pair,
-    min_overlap: Array | float,
     finished: Bool[Array, ""],
 ) -> Int[Array, ""]:
-    """Of the answer; an overlap of -1 marks one that is no mode."""
+    """Of the answer, the most serious last."""
     status = jnp.where(finished, Status.CONVERGED, Status.MAX_STEPS)
     status = jnp.where(doubtful, Status.AMBIGUOUS, status)
-    status = jnp.where(overlap < min_overlap, Status.LOW_OVERLAP, status)
-    status = jnp.where(overlap < 0, Status.NON_FINITE, status)
+    status = jnp.where(enough, status, Status.LOW_OVERLAP)
+    status = jnp.where(sound, status, Status.NON_FINITE)
     d = pair.source.points.shape[1]
     few = jnp.minimum(jnp.sum(pair.source.mask), jnp.sum(pair.target.mask)) < d + 1
     return jnp.where(few, Status.TOO_FEW_POINTS, status).astype(jnp.int32)

@@ -25,9 +25,10 @@ class Modes(BriefModule):
     Attributes:
         T_target_source: `(q, d+1, d+1)`.
         weight: `(q,)` share of the posterior; zero marks an unused row.
-        fitness: `(q,)` as in the solution, as the next three.
+        fitness: `(q,)` as in the solution, as the next four.
         overlap: `(q,)`; zero of unused rows.
         inlier_rmse: `(q,)`.
+        log_evidence: `(q,)`; `NO_EVIDENCE` of unused rows.
         covariance: `(q, k, k)` of each, as in the solution.
     """
 
@@ -36,6 +37,7 @@ class Modes(BriefModule):
     fitness: Float[Array, "*b q"]
     overlap: Float[Array, "*b q"]
     inlier_rmse: Float[Array, "*b q"]
+    log_evidence: Float[Array, "*b q"]
     covariance: Float[Array, "*b q k k"]
 
     @classmethod
@@ -45,12 +47,12 @@ class Modes(BriefModule):
         fitness: Float[Array, ""],
         overlap: Float[Array, ""],
         inlier_rmse: Float[Array, ""],
+        log_evidence: Float[Array, ""],
         covariance: Float[Array, "k k"],
     ) -> "Modes":
         """One pose with all the weight."""
-        weight = jnp.ones_like(fitness)
-        alone = T_target_source, weight, fitness, overlap, inlier_rmse, covariance
-        return cls(*(x[None] for x in alone))
+        told = jnp.ones_like(fitness), fitness, overlap, inlier_rmse, log_evidence
+        return cls(*(x[None] for x in (T_target_source, *told, covariance)))
 
     @property
     def margin(self) -> Float[Array, "*b"]:
@@ -102,13 +104,16 @@ class RegistrationSolution(eqx.Module):
     Attributes:
         T_target_source: `(d+1, d+1)` maps source coordinates to target coordinates.
         status: int32, see `Status`.
-        fitness: share of the source that lies on the target at this pose.
+        fitness: share of the source that lies on the target at this pose, within the
+            noise that the pair shows.
         inlier_rmse: root mean square distance of that share to the target's tangent
             planes, in the unit of the input.
         num_inliers: int32, points of the (thinned) source in that share.
-        overlap: geometric mean of the shares of source and target that lie on the
-            other, at most twice the lesser, times the consistencies: of the points
-            on, over or under the other surface, the share that lies on it.
+        overlap: share of the source that the target saw: points within the local
+            spacing of a sample and of its plane.
+        log_evidence: log of how much likelier the clouds are if their surfaces
+            coincide at this pose than if it is the best of wrong ones; comparable
+            between pairs, and above one of right poses (`jaxreg.matching.evidence`).
         num_steps: int32, steps of the local optimiser along the winning path.
         H: `(k, k)` Gauss-Newton matrix of the weighted energy of the last step, for a
             tangent (v, w), translation first: R -> exp(w) R, c -> c + v, where c is
@@ -128,6 +133,7 @@ class RegistrationSolution(eqx.Module):
     inlier_rmse: Float[Array, "*b"]
     num_inliers: Int[Array, "*b"]
     overlap: Float[Array, "*b"]
+    log_evidence: Float[Array, "*b"]
     num_steps: Int[Array, "*b"]
     H: Float[Array, "*b k k"]
     b: Float[Array, "*b k"]
@@ -145,6 +151,7 @@ class RegistrationSolution(eqx.Module):
                     f"RegistrationSolution({status}, "
                     f"fitness={float(self.fitness):.3f}, "
                     f"overlap={float(self.overlap):.3f}, "
+                    f"log_evidence={float(self.log_evidence):.1f}, "
                     f"inlier_rmse={float(self.inlier_rmse):.4g})"
                 )
             except TypeError:  # a tracer has a shape but no value

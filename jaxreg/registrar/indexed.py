@@ -15,16 +15,16 @@ class AbstractIndexedRegistrar(AbstractRegistrar):
     """A registrar that takes indexes built before, and knows several answers.
 
     `reconstruct` takes any registrar. Of this kind it builds the index of each scan
-    once, keeps the best of the modes of each pair, and believes by its `min_overlap`;
+    once, keeps the best of the modes of each pair, believes by its `min_log_evidence`;
     of others it keeps one pose a pair.
 
     Attributes:
         num_modes: rows of the `modes` of a solution.
-        min_overlap: below this overlap the status is LOW_OVERLAP.
+        min_log_evidence: of less evidence the status is LOW_OVERLAP.
     """
 
     num_modes: eqx.AbstractVar[int]
-    min_overlap: eqx.AbstractVar[Array | float]
+    min_log_evidence: eqx.AbstractVar[Array | float]
 
     @abc.abstractmethod
     def index_of(self, cloud: PointCloud) -> AbstractIndex:

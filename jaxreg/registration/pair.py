@@ -10,6 +10,7 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion
 from jaxreg.cloud import Frames
 from jaxreg.local import Curvature, tangent_unit
+from jaxreg.matching import NO_EVIDENCE
 from jaxreg.registrar import (
     AbstractRegistrar,
     Modes,
@@ -57,6 +58,7 @@ def _in_input_frames(
         inlier_rmse=frames.radius * solution.inlier_rmse,
         num_inliers=jnp.where(enough, solution.num_inliers, 0),
         overlap=jnp.where(enough, solution.overlap, 0),
+        log_evidence=jnp.where(enough, solution.log_evidence, NO_EVIDENCE),
         num_steps=solution.num_steps,
         H=curvature.H,
         b=curvature.b,
@@ -68,6 +70,7 @@ def _in_input_frames(
             modes.fitness,
             modes.overlap,
             frames.radius * modes.inlier_rmse,
+            modes.log_evidence,
             modes.covariance * jnp.outer(unit, unit),
         ),
         trace=trace,

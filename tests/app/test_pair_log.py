@@ -23,7 +23,8 @@ def _pairs(first: int, num: int) -> Pairs:
     T = rng.normal(size=(num, 2, 4, 4)).astype(np.float32)
     ids = np.arange(first, first + num)
     shape = num, 2
-    return Pairs(np.stack([ids, ids + 1], 1), T, rng.random(shape), rng.random(shape))
+    told = (rng.random(shape) for _ in range(3))
+    return Pairs(np.stack([ids, ids + 1], 1), T, *told)
 
 
 def test_pairs_come_back_to_the_last_bit(tmp_path: Path):
@@ -71,7 +72,8 @@ def test_without_resume_a_run_starts_anew(tmp_path: Path):
 
 def _changed(**changes: Any) -> bytes:
     row = {"pair": [2, 3], "T_i_j": [np.eye(4).tolist()] * 2}
-    row |= {"overlap": [0.5, 0.1], "inlier_rmse": [0.1, 0.1]} | changes
+    row |= {"overlap": [0.5, 0.1], "log_evidence": [5.0, -2.0]}
+    row |= {"inlier_rmse": [0.1, 0.1]} | changes
     return json.dumps(row).encode()
 
 

@@ -42,12 +42,13 @@ class _RowByRow(AbstractRegistrar):
             inlier_rmse=zero,
             num_inliers=none,
             overlap=one,
+            log_evidence=9 * one,
             num_steps=none,
             H=jnp.eye(3),
             b=jnp.zeros(3),
             error=zero,
             covariance=jnp.eye(3),
-            modes=Modes.alone(T, one, one, zero, jnp.eye(3)),
+            modes=Modes.alone(T, one, one, zero, 9 * one, jnp.eye(3)),
         )
 
 

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers import motion, pose_error
 
 from jaxreg.multiview import RelativeMotions
@@ -16,6 +17,9 @@ PAIRS = all_pairs(7)
 SECOND, LOST = (2, 6, 9, 14), (4, 17)
 
 
+LEAST = jnp.float32(1.0)
+
+
 def _motions(order: list[int]) -> RelativeMotions:
     i, j = PAIRS.T
     right = np.linalg.inv(T_TRUE[i]) @ T_TRUE[j]
@@ -26,14 +30,15 @@ def _motions(order: list[int]) -> RelativeMotions:
         modes[e, :2] = modes[e, 1::-1]
     modes[list(LOST), 0] = modes[list(LOST), 3]
     overlap[list(SECOND + LOST), 0] = 0.25
-    arrays = PAIRS, modes, overlap, 0.01 * overlap
+    log_evidence = np.where(overlap > 0, 20 * overlap - 2, -100).astype(np.float32)
+    arrays = PAIRS, modes, overlap, log_evidence, 0.01 * overlap
     return RelativeMotions(*(jnp.asarray(x[order]) for x in arrays))
 
 
 def test_a_second_mode_counts_where_it_agrees_with_the_poses():
     every = list(range(len(PAIRS)))
     for order in (every, every[::-1]):
-        found = place(_motions(order), 7, None, jnp.float32(0.1))
+        found = place(_motions(order), 7, None, LEAST)
         for T, T_true in zip(found.T_world_i, T_TRUE, strict=True):
             T_expected = np.linalg.inv(T_TRUE[0]) @ T_true
             angle, shift = pose_error(T, T_expected)
@@ -47,15 +52,28 @@ def test_a_second_mode_counts_where_it_agrees_with_the_poses():
 
 def test_without_second_modes_their_pairs_are_not_believed():
     motions = _motions(list(range(len(PAIRS)))).with_modes(1)
-    found = place(motions, 7, None, jnp.float32(0.1))
+    found = place(motions, 7, None, LEAST)
     wrong = np.isin(range(len(PAIRS)), SECOND + LOST)
     np.testing.assert_array_equal(np.asarray(found.edge_weight) < 0.1, wrong)
 
 
 def test_the_only_pair_of_two_scans_needs_no_other_to_confirm_it():
     T_i_j = jnp.asarray(np.linalg.inv(T_TRUE[0]) @ T_TRUE[1])[None, None]
-    weak = jnp.full((1, 1), 0.15)
-    pair = RelativeMotions(jnp.array([[0, 1]], jnp.int32), T_i_j, weak, weak)
+    weak, told = jnp.full((1, 1), 0.15), LEAST + jnp.full((1, 1), 0.5)
+    ids = jnp.array([[0, 1]], jnp.int32)
+    pair = RelativeMotions(ids, T_i_j, weak, told, weak)
     for num_scans, parts in ((2, [0, 0]), (3, [0, 1, 2])):
-        found = place(pair, num_scans, None, jnp.float32(0.1))
+        found = place(pair, num_scans, None, LEAST)
         np.testing.assert_array_equal(found.part, parts)
+
+
+@pytest.mark.parametrize("num_loops", [0, 1])
+def test_loops_join_scans_none_of_whose_pairs_would_be_believed(num_loops):
+    ids = np.array([[0, 1], [1, 2], [0, 2]][: 2 + num_loops], np.int32)
+    i, j = ids.T
+    T_i_j = (np.linalg.inv(T_TRUE[i]) @ T_TRUE[j])[:, None].astype(np.float32)
+    told = jnp.full((len(ids), 1), LEAST - 0.5)
+    share = jnp.full((len(ids), 1), 0.3)
+    motions = RelativeMotions(jnp.asarray(ids), jnp.asarray(T_i_j), share, told, share)
+    found = place(motions, 3, None, LEAST)
+    np.testing.assert_array_equal(found.part, [0, 0, 0] if num_loops else [0, 1, 2])

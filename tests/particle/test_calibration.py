@@ -78,7 +78,7 @@ def test_a_region_against_scipy():
     T, other, centroid = motion(1, 3), motion(2, 3), np.array([1.0, 2.0, 3.0])
     weight = np.array([0.03, 0.97, 0.0])
     poses = np.stack([other, T, other])
-    given = poses, weight, weight, weight, weight, [covariance] * 3
+    given = poses, *(weight for _ in range(5)), [covariance] * 3
     modes = Modes(*map(jnp.asarray, given))
     error = np.linalg.cholesky(covariance) @ rng.normal(size=6)
     true = np.eye(4)

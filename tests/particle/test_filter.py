@@ -84,7 +84,7 @@ def _conclude(pair, found):
         kernel=L2(),
         num_modes=2,
         refine_steps=0,
-        min_overlap=0.12,
+        min_log_evidence=0.0,
     )
 
 

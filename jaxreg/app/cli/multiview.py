@@ -173,7 +173,13 @@ def _pairs(motions: Any) -> Pairs:
     return Pairs(
         *map(
             np.asarray,
-            (motions.pairs, motions.T_i_j, motions.overlap, motions.inlier_rmse),
+            (
+                motions.pairs,
+                motions.T_i_j,
+                motions.overlap,
+                motions.log_evidence,
+                motions.inlier_rmse,
+            ),
         )
     )
 

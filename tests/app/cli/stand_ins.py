@@ -102,7 +102,7 @@ def fake_reconstruct(
         lost, overlap = Status.LOW_OVERLAP, jnp.asarray(np.where(both, 0.8, 0.1))
         zeros = jnp.zeros(len(edges))
         dropped = [np.sum(~np.isfinite(s).all(1)) for s in scans]
-        modes = (x[:, None] for x in (graph.T_i_j, overlap, zeros))
+        modes = (x[:, None] for x in (graph.T_i_j, overlap, 9 * overlap, zeros))
         return jaxreg.ReconstructionSolution(
             T_world_i=jnp.asarray(T),
             status=jnp.asarray(0 if all(placed) else Status.DISCONNECTED, int),
@@ -133,6 +133,7 @@ def registered(T: np.ndarray, status: int, overlap: float) -> Any:
         inlier_rmse=jnp.asarray(0.02),
         num_inliers=number,
         overlap=jnp.asarray(overlap),
+        log_evidence=jnp.asarray(9 * overlap),
         num_steps=number,
         H=jnp.eye(6),
         b=jnp.zeros(6),
@@ -144,6 +145,7 @@ def registered(T: np.ndarray, status: int, overlap: float) -> Any:
             fitness=0.95 * modes,
             overlap=overlap * modes,
             inlier_rmse=0.02 * modes,
+            log_evidence=9 * overlap * modes,
             covariance=jnp.stack([covariance] * 2),
         ),
     )

@@ -83,6 +83,7 @@ def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
         jnp.array([[0, 1]]),
         jnp.eye(4)[None, None],
         jnp.array([[0.7]]),
+        jnp.array([[5.0]]),
         jnp.array([[0.01]]),
     )
 

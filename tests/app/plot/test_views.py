@@ -35,18 +35,19 @@ def _registration(status: int = 0) -> jaxreg.RegistrationSolution:
         inlier_rmse=0.01 * one,
         num_inliers=jnp.asarray(60, jnp.int32),
         overlap=one,
+        log_evidence=4 * one,
         num_steps=jnp.asarray(5, jnp.int32),
         H=six,
         b=six[0],
         error=one,
         covariance=1e-4 * six,
-        modes=Modes.alone(T, one, one, 0.01 * one, 1e-4 * six),
+        modes=Modes.alone(T, one, one, 0.01 * one, 4 * one, 1e-4 * six),
     )
 
 
 def _reconstruction() -> jaxreg.ReconstructionSolution:
     ones = jnp.ones(3)
-    one = 0.5 * ones[:, None], 0.01 * ones[:, None]
+    one = [x * ones[:, None] for x in (0.5, 4.0, 0.01)]
     return jaxreg.ReconstructionSolution(
         T_world_i=jnp.asarray(T_WORLD),
         status=jnp.asarray(Status.DISCONNECTED, jnp.int32),

@@ -1,0 +1,181 @@
+"""How likely two surfaces are to coincide at a pose."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from evidence_clouds import EYE, SPACING, UP, as_cloud, floor, witness
+from helpers import motion
+from scipy.spatial import KDTree
+from scipy.stats import norm
+
+from jaxreg.cloud import PointCloud, thin
+from jaxreg.datasets import sculpture_scans
+from jaxreg.matching import NO_EVIDENCE, Evidence
+
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
+def _told(source: np.ndarray, normals: np.ndarray = UP) -> Evidence:
+    return witness(as_cloud(source, normals), as_cloud(floor(0), UP)).of_pose(EYE)
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[PointCloud]:
+    """Two views of a sculpture that share two thirds, in one frame."""
+    points, T_world_i = sculpture_scans(12, seed=0)
+    clouds = []
+    for k in (0, 1):
+        T = np.asarray(T_world_i[k])
+        x = np.asarray(points[k]) @ T[:3, :3].T + T[:3, 3]
+        clouds.append(thin(jnp.asarray(x, jnp.float32), jnp.ones(len(x), bool), 1024, 10))
+    return clouds
+
+
+def test_the_share_within_a_spacing_overlaps_and_points_beyond_do_not():
+    assert float(_told(floor(0)).overlap) == 1
+    half = _told(floor(0, shift=8 * SPACING))
+    assert float(half.overlap) == pytest.approx(9 / 16, abs=0.01)  # a spacing more
+    assert float(_told(floor(4 * SPACING)).overlap) == 0
+
+
+def test_less_fits_less_likely():
+    told = [_told(floor(0))]
+    rng = np.random.default_rng(0)
+    for noise in (0.02, 0.05, 0.1, 0.2):
+        told.append(_told(floor(0) + [0, 0, 1] * rng.normal(0, noise, (256, 1))))
+    evidence = [float(x.log_evidence) for x in told]
+    assert evidence == sorted(evidence, reverse=True)
+    assert evidence[-1] < 0 < evidence[0]
+
+
+def test_points_over_and_under_the_other_surface_speak_against_a_pose():
+    parted = np.concatenate([floor(0)[:128], floor(0.2)[128:]])
+    alone = floor(0)[:128]
+    both = float(_told(parted).log_evidence)
+    assert both < 0 < float(_told(alone, UP[:128]).log_evidence)
+
+
+def test_normals_that_cross_are_chance():
+    across = np.tile([1.0, 0.0, 0.0], (256, 1))
+    assert float(_told(floor(0), across).log_evidence) < 0
+    assert float(_told(floor(0), across).fitness) < 0.5
+
+
+def test_a_change_of_unit_and_of_frame_changes_nothing(scans):
+    source, target = scans
+    plain = witness(source, target).of_pose(EYE)
+    T = jnp.asarray(motion(3, 3), jnp.float32)
+    R, t = T[:3, :3], T[:3, 3]
+    moved = [
+        PointCloud(50 * (x.points @ R.T + t), x.normals @ R.T, x.mask) for x in scans
+    ]
+    other = witness(*moved).of_pose(EYE)
+    np.testing.assert_allclose(other.overlap, plain.overlap, atol=0.02)
+    np.testing.assert_allclose(other.log_evidence, plain.log_evidence, atol=0.3)
+
+
+def test_thinning_changes_neither_verdict_nor_overlap():
+    points, T_world_i = sculpture_scans(12, seed=0)
+    clouds = []
+    for k in (0, 1):
+        T = np.asarray(T_world_i[k])
+        clouds.append(np.asarray(points[k]) @ T[:3, :3].T + T[:3, 3])
+    overlap, evidence = [], []
+    for capacity in (256, 512, 1024, 2048):
+        some = [
+            thin(jnp.asarray(x, jnp.float32), jnp.ones(len(x), bool), capacity, 10)
+            for x in clouds
+        ]
+        told = witness(*some).of_pose(EYE)
+        overlap.append(float(told.overlap))
+        evidence.append(float(told.log_evidence))
+    assert max(overlap[1:]) - min(overlap[1:]) < 0.05
+    assert min(evidence) > 1
+
+
+def test_wrong_poses_have_little_evidence(scans):
+    told = witness(*scans)
+    right = float(told.of_pose(EYE).log_evidence)
+    assert right > 4
+    for seed in range(5):
+        T = jnp.asarray(motion(seed, 3, angle=1.0, shift=0.0), jnp.float32)
+        assert float(told.of_pose(T).log_evidence) < 0
+
+
+def _oracle(source: PointCloud, target: PointCloud) -> tuple[float, float]:
+    """Gain and share near of one way in float64, with the definitions spelled out."""
+    p, n = np.asarray(source.points, float), np.asarray(source.normals, float)
+    q, m = np.asarray(target.points, float), np.asarray(target.normals, float)
+    own = KDTree(p).query(p, 5)[0][:, 1:].mean(1)
+    other = KDTree(q).query(q, 5)[0][:, 1:].mean(1)
+    distance, row = KDTree(q).query(p)
+    reach = np.maximum(own, other[row])
+    height = np.abs(np.sum(m[row] * (q[row] - p), axis=1))
+    along = np.sqrt(np.maximum(distance**2 - height**2, 0))
+    u, cosine = height / reach, np.abs(np.sum(n * m[row], axis=1))
+    beside = (along < reach) & (u < 3)
+    u, cosine = u[beside], np.maximum(cosine[beside], 1e-3)
+    balance = _balance(n)[beside]
+    w, s, k = 0.5, 0.2, 4.0
+    for _ in range(16):
+        on = w * norm.pdf(u, scale=s) * (k + 1) * cosine**k
+        part = balance * on / (on + (1 - w) / 6)
+        w = part.sum() / balance.sum()
+        s = np.sqrt(np.sum(part * u**2) / part.sum())
+        k = min(-1 - part.sum() / np.sum(part * np.log(cosine)), 200.0)
+    ratio = w * 6 * norm.pdf(u, scale=s) * (k + 1) * cosine**k + 1 - w
+    return np.sum(balance * np.log(ratio)) / balance.sum(), np.mean(u < 1)
+
+
+def _balance(normals: np.ndarray) -> np.ndarray:
+    """One over the density of directions, smoothed over axes on a half sphere."""
+    step = np.arange(128) + 0.5
+    z, turn = step / 128, np.pi * (1 + 5**0.5) * step
+    axes = np.stack([np.sqrt(1 - z * z) * f(turn) for f in (np.cos, np.sin)] + [z], 1)
+    kernel = (normals @ axes.T) ** 16
+    density = kernel @ kernel.mean(0) / kernel.sum(1)
+    return 1 / np.maximum(density, 1 / len(normals))
+
+
+def test_evidence_agrees_with_an_oracle_in_float64(scans):
+    source, target = (
+        PointCloud(x.points[x.mask], x.normals[x.mask], x.mask[x.mask]) for x in scans
+    )
+    (gain_a, near_a), (gain_b, near_b) = _oracle(source, target), _oracle(target, source)
+    expected = 2.3 * np.log((gain_a + gain_b) / 2) + 38 * np.sqrt(near_a * near_b) - 34.8
+    found = witness(source, target).of_pose(EYE)
+    np.testing.assert_allclose(found.log_evidence, expected, atol=0.05)
+
+
+def test_masked_points_say_nothing():
+    cloud, target = as_cloud(floor(0), UP), as_cloud(floor(0), UP)
+    mask = jnp.arange(256) < 100
+    found = witness(PointCloud(cloud.points, cloud.normals, mask), target).of_pose(EYE)
+    assert int(found.num_inliers) == 100
+    assert float(found.overlap) == 1
+
+
+def test_poses_not_in_use_have_none(scans):
+    T = jnp.stack([EYE, EYE])
+    told = witness(*scans).of_poses(T, jnp.array([True, False]))
+    assert float(told.log_evidence[1]) == NO_EVIDENCE
+    assert float(told.log_evidence[0]) > 0
+
+
+def test_points_that_the_other_scanner_looked_through_speak_against_a_pose():
+    wall, ahead = as_cloud(floor(0), UP), np.concatenate([floor(0), floor(1)[100:104]])
+    eye = jnp.array([0.75, 0.75, 3.0])
+    source = as_cloud(ahead, np.tile([0.0, 0.0, 1.0], (260, 1)))
+    plain, seen = (
+        float(witness(source, target).of_pose(EYE).log_evidence)
+        for target in (wall, wall.seen_from(eye))
+    )
+    assert seen < 0 < plain
+
+
+def test_the_gradient_free_answer_is_finite_where_nothing_is_near():
+    far = _told(floor(100.0))
+    assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(far))
+    assert float(far.log_evidence) < 0

@@ -1,0 +1,74 @@
+"""Whether surfaces that agree can slip along each other."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from evidence_clouds import EYE, UP, as_cloud, floor, witness
+from helpers import blob, motion
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxreg.matching import Grip, Problem, match
+from jaxreg.neighbours import BruteForce
+
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
+def _slips(points: np.ndarray, normals: np.ndarray) -> bool:
+    cloud = as_cloud(points, normals)
+    return not bool(witness(cloud, cloud).of_pose(EYE).grip.holds)
+
+
+def test_surfaces_that_move_in_themselves_slip():
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((400, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    assert _slips(x, x)  # a sphere
+    ring = x * [1, 1, 0] / np.linalg.norm(x[:, :2], axis=1, keepdims=True)
+    assert _slips(ring + x * [0, 0, 1], ring)  # a cylinder
+    assert _slips(floor(0), UP)
+    cube = np.where(np.abs(x) == np.abs(x).max(1, keepdims=True), np.sign(x), 0)
+    assert not _slips(cube + x * (cube == 0), cube)
+
+
+def test_points_without_normals_hold_a_pose():
+    points = blob(400, 3)
+    assert not _slips(points, np.zeros_like(points))
+
+
+def _grip(points: np.ndarray, normals: np.ndarray) -> Grip:
+    cloud = as_cloud(points, normals)
+    index = BruteForce.build(cloud.points, cloud.mask)
+    found = match(Problem.of(cloud, cloud, index), EYE)
+    return Grip.of(found, found.rotated, jnp.ones(len(points), bool))
+
+
+def test_three_floors_hold_together_what_none_of_them_holds():
+    # Planes across the three axes, off the origin.
+    turns = [np.roll(np.eye(3), k, axis=1) for k in range(3)]
+    grips = [_grip((floor(0) + 1) @ R, UP @ R) for R in turns]
+    for some in itertools.product([False, True], repeat=3):
+        chosen = [g for g, use in zip(grips, some, strict=True) if use]
+        if chosen:
+            total = jax.tree.map(lambda *x: sum(x), *chosen)
+            assert bool(total.holds) == (len(chosen) == 3)
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_a_grip_holds_if_its_least_eigenvalue_is_large(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.standard_normal((16, 3))
+    normals = rng.standard_normal((16, 3)) * rng.uniform(0.05, 0.25)
+    x = points - points.mean(0)
+    J = np.concatenate([normals, np.cross(x, normals)], axis=1)
+    least = np.sqrt(np.linalg.eigvalsh(J.T @ J / 16)[0])
+    grip = _grip(points, normals)
+    T = jnp.asarray(motion(seed, 3), jnp.float32)
+    for seen in (grip, grip.seen_from(T)):
+        if abs(least - 0.07) > 1e-4:
+            assert bool(seen.holds) == (least > 0.07)
