@@ -56,7 +56,7 @@ class AbstractKernel(BriefModule):
     ) -> Width:
         """The width that the data suggest, in the unit of the residual.
 
-        Most kernels take `three_lower_thirds`.
+        Most kernels take `by_lower_third`.
 
         Args:
             sq_residual: `(n,)` squared residual norms.
@@ -69,16 +69,16 @@ class AbstractKernel(BriefModule):
         """
 
 
-def three_lower_thirds(
+def by_lower_third(
     self: AbstractKernel, sq_residual: Float[Array, " n"], mask: Bool[Array, " n"]
 ) -> Width:
-    """Three times the lower third of the norms: a `width_of` for most kernels.
+    """Half more than the lower third of the norms: a `width_of` for most kernels.
 
     It follows the residuals of the points that fit, as long as a third of the points
-    do. (Of a Gaussian residual in one dimension, the lower third is 0.43 standard
-    deviations.)
+    do. (Of 93 pairs of lidar, RGB-D and objects and guesses up to 45 degrees off ICP
+    finds 204, 208, 203 and 198 of 372 with 1, 1.5, 2 and 3 of it.)
     """
-    return 3 * jnp.sqrt(masked_quantile(sq_residual, mask, 1 / 3))
+    return 1.5 * jnp.sqrt(masked_quantile(sq_residual, mask, 1 / 3))
 
 
 def _square(width: Width) -> Width:
@@ -95,7 +95,7 @@ class L2(AbstractKernel):
     Not redescending. The fastest and most accurate without outliers, ruined by one.
     """
 
-    width_of = three_lower_thirds
+    width_of = by_lower_third
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """r^2 / 2."""
@@ -113,7 +113,7 @@ class L1(AbstractKernel):
     from the solution.
     """
 
-    width_of = three_lower_thirds
+    width_of = by_lower_third
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """sqrt(r^2 + width^2) - width, written so that it does not cancel near zero."""
@@ -132,7 +132,7 @@ class Huber(AbstractKernel):
     but not vanishing, pull of the others. A safe choice far from the solution.
     """
 
-    width_of = three_lower_thirds
+    width_of = by_lower_third
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """r^2 / 2, or width (r - width / 2) where r > width."""
@@ -155,7 +155,7 @@ class Cauchy(AbstractKernel):
     pull. Between Huber and GemanMcClure when the start is neither near nor far.
     """
 
-    width_of = three_lower_thirds
+    width_of = by_lower_third
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """width^2 / 2 log(1 + r^2 / width^2)."""
@@ -175,7 +175,7 @@ class GemanMcClure(AbstractKernel):
     large.
     """
 
-    width_of = three_lower_thirds
+    width_of = by_lower_third
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """r^2 / 2 / (1 + r^2 / width^2)."""
@@ -194,7 +194,7 @@ class Tukey(AbstractKernel):
     do not count at all: for the last steps, when outliers are well apart from the rest.
     """
 
-    width_of = three_lower_thirds
+    width_of = by_lower_third
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """width^2 / 6 (1 - (1 - u)^3) with u = r^2 / width^2 clipped at one."""
@@ -215,7 +215,7 @@ class Welsch(AbstractKernel):
     choice where the noise of the good residuals is Gaussian of that width.
     """
 
-    width_of = three_lower_thirds
+    width_of = by_lower_third
 
     def rho(self, sq_residual: Values, width: Width) -> Values:
         """width^2 (1 - exp(-r^2 / (2 width^2)))."""

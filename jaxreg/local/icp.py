@@ -37,7 +37,7 @@ from jaxreg.local.implicit import stationary
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.scale import first_guess
 from jaxreg.local.steps import AbstractStep, GaussNewton
-from jaxreg.matching.evidence import Evidence, Witness
+from jaxreg.matching.evidence import LIKELY, Evidence, Witness
 from jaxreg.matching.problem import Match, Problem, match
 from jaxreg.matching.residuals import AbstractResidual, PlaneToPlane
 from jaxreg.neighbours import (
@@ -54,10 +54,6 @@ from jaxreg.registrar import (
     prepare_pair,
 )
 from jaxreg.robust import AbstractKernel, GemanMcClure
-
-
-# Of less evidence the end is no answer: at even odds, as a guess has as a rule.
-_LEAST_EVIDENCE = 0.0
 
 
 class ICP(AbstractRegistrar):
@@ -290,9 +286,10 @@ def _status(
 ) -> Int[Array, ""]:
     """Of the answer `T`, from that of the loop; the most serious last."""
     status = jnp.where(free, Status.DEGENERATE, status)
-    status = jnp.where(
-        evidence.log_evidence >= _LEAST_EVIDENCE, status, Status.LOW_OVERLAP
-    )
+    # Steps that have run out say so first: more of them may find evidence.
+    unlikely = evidence.log_evidence < LIKELY
+    unlikely &= (status != Status.MAX_STEPS) | (evidence.overlap == 0)
+    status = jnp.where(unlikely, Status.LOW_OVERLAP, status)
     status = jnp.where(worse, Status.DIVERGED, status)
     status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
     return status.astype(jnp.int32)

@@ -1,5 +1,6 @@
 """Points of one cloud beside those of another: residuals, evidence, slippage."""
 
+from jaxreg.matching.evidence import LIKELY as LIKELY
 from jaxreg.matching.evidence import NO_EVIDENCE as NO_EVIDENCE
 from jaxreg.matching.evidence import Evidence as Evidence
 from jaxreg.matching.evidence import Witness as Witness

@@ -49,6 +49,9 @@ from jaxreg.matching.slippage import Grip
 from jaxreg.neighbours import AbstractIndex, BruteForce
 
 
+#: Poses of no less log evidence are believed, on all data alike: at equal odds before,
+#: one of 1 + e such answers would be wrong if none had more; of generated pairs TODO.
+LIKELY = 1.0
 #: Of poses that are none: less than any pose has.
 NO_EVIDENCE = -100.0
 # The discriminant; `near` weighs like 25 independent places of which 95 % of those of

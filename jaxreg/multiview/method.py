@@ -5,7 +5,7 @@ from jaxtyping import Array
 from jaxreg._core.typing import Key, Scalar
 from jaxreg.cloud import Frames, PointCloud
 from jaxreg.local import GaussNewton, LocalOptimiser
-from jaxreg.matching import PointToPlane
+from jaxreg.matching import LIKELY, PointToPlane
 from jaxreg.neighbours import AbstractIndex, VoxelTable
 from jaxreg.particle import AbstractSearch
 from jaxreg.registrar import (
@@ -18,9 +18,9 @@ from jaxreg.robust import GemanMcClure
 
 # Modes of a pair that are kept; most pairs have no second one.
 _MOST_MODES = 4
-# Of methods that do not say: the least evidence that is believed, and the kernel width
-# of the first step, in radii, those of `ParticleFilter()`.
-_MIN_LOG_EVIDENCE, _WIDEST = 1.0, 0.3
+# The kernel width of the first step, in radii, of methods that do not say: that of
+# `ParticleFilter()`.
+_WIDEST = 0.3
 
 
 def num_kept(method: AbstractRegistrar) -> int:
@@ -34,7 +34,7 @@ def min_log_evidence(method: AbstractRegistrar) -> Array | float:
     """The least evidence of a pair that is believed on its own."""
     if isinstance(method, AbstractIndexedRegistrar):
         return method.min_log_evidence
-    return _MIN_LOG_EVIDENCE
+    return LIKELY
 
 
 def index_of(method: AbstractRegistrar, cloud: PointCloud) -> AbstractIndex:

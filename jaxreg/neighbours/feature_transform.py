@@ -82,7 +82,7 @@ def _closest_in_each_cell(
     home = jnp.zeros(len(at), jnp.int32)
     for axis in range(d):
         home = home * resolution + at[:, axis]
-    to_centre = in_cells - jnp.floor(in_cells) - 0.5
+    to_centre = in_cells - at - 0.5  # of points beyond the grid farther than a cell
     sq = jnp.where(mask, jnp.sum(to_centre**2, axis=-1), jnp.inf)
     rows = jnp.arange(len(in_cells), dtype=jnp.int32)
 

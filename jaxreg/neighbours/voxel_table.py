@@ -1,6 +1,6 @@
 """Approximate closest points from a table: one look-up a query, whatever the target.
 
-A cubic grid over the target's bounding box and a margin around it stores in every cell
+A cubic grid over the bulk of the target and a margin around it stores in every cell
 the K target points closest to the cell's centre, found by a feature transform. A query
 is answered with the nearest of its cell's K candidates; outside the grid, with those of
 the nearest cell, and its true distance to the point found.
@@ -30,6 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.neighbours.base import AbstractIndex, closest_only
+from jaxreg.neighbours.extent import bulk_extent
 from jaxreg.neighbours.feature_transform import feature_transform, smallest
 
 
@@ -66,8 +67,8 @@ class VoxelTable(AbstractIndex):
             mask: `(m,)` True for valid points; those that are not finite are not.
             resolution: cells along each axis, 512 in 2D and 64 in 3D by default; the
                 table holds resolution^d integers, 1 MB in either case.
-            margin: the grid reaches beyond the longest side of the bounding box by
-                this share of it on every side.
+            margin: the grid reaches beyond the longest side of the box that holds the
+                bulk of the points by this share of it on every side.
             candidates: K. For K > 1 the table also holds the candidates' coordinates,
                 K (d + 1) MB in all, which answers twice as fast as fetching them.
 
@@ -149,9 +150,8 @@ class VoxelTable(AbstractIndex):
 
 
 def _grid(points: Array, mask: Array, resolution: int, margin: float):
-    """Origin and side of a cell of the cubic grid around the valid points."""
-    low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(mask[:, None], points, -jnp.inf), axis=0)
+    """Origin and side of a cell of the cubic grid around the bulk of the points."""
+    low, high = bulk_extent(points, mask)
     filled = jnp.any(mask)
     low, high = jnp.where(filled, low, 0), jnp.where(filled, high, 1)
     side = jnp.max(high - low)

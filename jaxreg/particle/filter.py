@@ -29,7 +29,7 @@ from jaxreg._core.checks import (
 )
 from jaxreg._core.typing import Key, Motion
 from jaxreg.local import AbstractStep, GaussNewton
-from jaxreg.matching import AbstractResidual, PointToPlane, Problem
+from jaxreg.matching import LIKELY, AbstractResidual, PointToPlane, Problem
 from jaxreg.neighbours import IndexBuilder
 from jaxreg.particle.base import Found
 from jaxreg.particle.draw import SETTLE_STEPS, most_look_ups, with_settled
@@ -119,7 +119,7 @@ class ParticleFilter(AbstractFilter):
     width_start: Array | float = traced(0.3)
     width_end: Array | float = traced(0.06)
     tolerance: Array | float = traced(1e-4)
-    min_log_evidence: Array | float = traced(1.0)
+    min_log_evidence: Array | float = traced(LIKELY)
 
     def __check_init__(self) -> None:
         """Refuses counts that leave nothing to do."""

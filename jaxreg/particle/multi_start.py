@@ -10,7 +10,7 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts
 from jaxreg._core.typing import Key, Motion
 from jaxreg.local import AbstractStep, GaussNewton, decoupled_error
-from jaxreg.matching import AbstractResidual, PointToPlane, Problem, match
+from jaxreg.matching import LIKELY, AbstractResidual, PointToPlane, Problem, match
 from jaxreg.neighbours import IndexBuilder
 from jaxreg.particle.base import AbstractSearch, Found
 from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy
@@ -65,7 +65,7 @@ class MultiStart(AbstractSearch):
     width_start: Array | float = traced(0.3)
     width_end: Array | float = traced(0.06)
     tolerance: Array | float = traced(1e-4)
-    min_log_evidence: Array | float = traced(1.0)
+    min_log_evidence: Array | float = traced(LIKELY)
 
     def __check_init__(self) -> None:
         """Refuses counts that leave nothing to do."""

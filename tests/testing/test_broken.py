@@ -13,7 +13,7 @@ from jaxreg.averaging.base import solution
 from jaxreg.local import turn_and_shift
 from jaxreg.neighbours import BruteForce
 from jaxreg.particle import UniformPrior
-from jaxreg.robust import three_lower_thirds
+from jaxreg.robust import by_lower_third
 from jaxreg.testing import (
     check_averager,
     check_dynamics,
@@ -57,10 +57,10 @@ class Kernel(jr.AbstractKernel):
 
     def width_of(self, sq_residual, mask):
         if self.twist == "squared width":
-            return three_lower_thirds(self, sq_residual, mask) ** 2
+            return by_lower_third(self, sq_residual, mask) ** 2
         if self.twist == "masked width":
-            return three_lower_thirds(self, sq_residual, jnp.ones_like(mask))
-        return three_lower_thirds(self, sq_residual, mask)
+            return by_lower_third(self, sq_residual, jnp.ones_like(mask))
+        return by_lower_third(self, sq_residual, mask)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_a_python_float_would_compile_again():
         number: float = 1.0
         rho = robust.L2.rho
         weight = robust.L2.weight
-        width_of = three_lower_thirds
+        width_of = by_lower_third
 
     with pytest.raises(AssertionError, match=r"Fixed\.number is a Python float"):
         check_kernel(Fixed())
