@@ -1,5 +1,7 @@
 """`PointCloud`: points with normals and a mask."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -21,6 +23,8 @@ class PointCloud(BriefModule):
         seen: what the scanner saw of them, where its viewpoint is known.
         spacing: `(n,)` mean distance to the nearest other points, two on a curve and
             four on a surface, where it is known (`with_spacing`).
+        fine: the same surface with more points, for the last digits of a pose; None if
+            there are no more.
     """
 
     points: Float[Array, "n d"]
@@ -28,6 +32,7 @@ class PointCloud(BriefModule):
     mask: Bool[Array, " n"]
     seen: RangeImage | None = None
     spacing: Float[Array, " n"] | None = None
+    fine: "PointCloud | None" = None
 
     def padded(self, num: int) -> "PointCloud":
         """With masked rows behind it, `num` in all."""
@@ -38,6 +43,7 @@ class PointCloud(BriefModule):
             jnp.pad(self.mask, rows),
             self.seen,
             None if self.spacing is None else jnp.pad(self.spacing, rows),
+            self.fine,
         )
 
     def first(self, num: int) -> "PointCloud":
@@ -52,7 +58,13 @@ class PointCloud(BriefModule):
             self.mask[rows],
             self.seen,
             None if self.spacing is None else self.spacing[rows],
+            self.fine,
         )
+
+    @property
+    def finest(self) -> "PointCloud":
+        """With the most points there are."""
+        return self if self.fine is None else self.fine
 
     def spread(self, num: int) -> "PointCloud":
         """At most so many valid rows, spread over the array; no spacing is known."""
@@ -65,7 +77,7 @@ class PointCloud(BriefModule):
     def seen_from(self, viewpoint: Float[Array, " d"]) -> "PointCloud":
         """With what was seen of it from there; of NaN nothing is known."""
         seen = RangeImage.of(self.points, self.mask, viewpoint)
-        return PointCloud(self.points, self.normals, self.mask, seen, self.spacing)
+        return replace(self, seen=seen)
 
     def with_spacing(self) -> "PointCloud":
         """With the spacing around each point, by comparing all pairs if not known."""
@@ -74,7 +86,7 @@ class PointCloud(BriefModule):
         num = 1 + num_around(self.points.shape[1])
         found = BruteForce.build(self.points, self.mask).query(self.points, num)
         spacing = spacing_around(found, self.mask)
-        return PointCloud(self.points, self.normals, self.mask, self.seen, spacing)
+        return replace(self, spacing=spacing)
 
 
 def num_around(d: int) -> int:

@@ -29,8 +29,9 @@ from jaxreg.neighbours import (
     VoxelTable,
     check_index,
 )
-from jaxreg.particle.conclude import Pair, conclude
+from jaxreg.particle.conclude import conclude
 from jaxreg.particle.energies import AbstractEnergy
+from jaxreg.particle.pair import Pair
 from jaxreg.particle.priors import AbstractPrior, GaussianPrior, UniformPrior
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import (
@@ -47,6 +48,9 @@ from jaxreg.robust import AbstractKernel
 _FEW = 600
 # The agreement of normals decides what is trusted: the careful estimate.
 _NORMAL_NEIGHBOURS = 10
+# As many times more points tell the last digits. (Median errors of eleven lidar pairs
+# with 4,096 points, 16,384 and all: 36, 14 and 22 mm.)
+_FINE = 4
 
 
 class Found(eqx.Module):
@@ -116,9 +120,16 @@ class AbstractSearch(AbstractIndexedRegistrar):
         return eqx.tree_at(lambda m: m.prior, self, self.prior.in_frames(frames))
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
-        """Without noise that fills the box, thinned to `max_points`, with normals."""
-        mask = without_noise(points, mask)
-        return thin(points, mask, self.max_points, _NORMAL_NEIGHBOURS)
+        """Without noise that fills the box, thinned to `max_points`, with normals.
+
+        And once more to `_FINE` times as many, for the last steps.
+        """
+        mask, n = without_noise(points, mask), len(mask)
+        cloud = thin(points, mask, self.max_points, _NORMAL_NEIGHBOURS)
+        if n <= self.max_points:
+            return cloud
+        fine = thin(points, mask, min(n, _FINE * self.max_points))
+        return dataclasses.replace(cloud, fine=fine)
 
     def problem(self, pair: tuple[Array, ...], key: Key) -> Problem:
         """What `search` works on, of a source, a target and their masks; traced."""

@@ -3,16 +3,14 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.arrays import cast_floats, on_both
+from jaxreg._core.arrays import cast_floats
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.cloud import PointCloud, levelled, median_spacing
 from jaxreg.geometry import lie
 from jaxreg.local import Curvature, GaussNewton, LocalOptimiser
 from jaxreg.matching import (
@@ -20,11 +18,11 @@ from jaxreg.matching import (
     PlaneToPlane,
     PointToPlane,
     Problem,
-    Witness,
     match,
 )
-from jaxreg.neighbours import AbstractIndex, index_within
+from jaxreg.particle.last_digits import last_digits
 from jaxreg.particle.modes import distinct_modes, first_within
+from jaxreg.particle.pair import Pair
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import Modes, RegistrationSolution
 from jaxreg.robust import AbstractKernel
@@ -34,7 +32,7 @@ from jaxreg.robust import AbstractKernel
 _APART = 0.3
 #: A second mode is a rival of the first if its log evidence falls short of the first's
 #: by less than this. (Poses that a symmetry makes equal differ by 0.25 at most, in 108
-#: pairs of cubes, boxes, prisms and tori of 500 to 4,000 points with and without noise.)
+#: pairs of cubes, boxes, prisms and tori of 500 to 4,000 points, with noise or not.)
 RIVAL_MARGIN = 0.5
 # Modes of so much less evidence than the first are not worth the last steps.
 _HOPELESS = 6.0
@@ -43,47 +41,6 @@ _POLISH = 8
 
 
 Out = TypeVar("Out")
-
-
-class Pair(eqx.Module):
-    """Two prepared clouds with their indexes."""
-
-    source: PointCloud
-    target: PointCloud
-    source_index: AbstractIndex
-    target_index: AbstractIndex
-
-    @property
-    def problem(self) -> Problem:
-        """The source to be registered to the target, all points."""
-        return Problem.of(self.source, self.target, self.target_index)
-
-    @property
-    def exact(self) -> "Pair":
-        """With indexes that miss no near point; tables miss every other."""
-        indexes = on_both(
-            lambda cloud: index_within(
-                cloud.points, cloud.mask, median_spacing(cloud.points, cloud.mask)
-            ),
-            *levelled(self.source, self.target),
-        )
-        return Pair(self.source, self.target, *indexes)
-
-    @property
-    def witness(self) -> Witness:
-        """Who tells how likely poses are."""
-        clouds = self.source, self.target
-        return Witness.of(*clouds, self.source_index, self.target_index)
-
-    @property
-    def spacing(self) -> Scalar:
-        """Between samples of the coarser cloud."""
-        return jnp.maximum(
-            *on_both(
-                lambda cloud: median_spacing(cloud.points, cloud.mask),
-                *levelled(self.source, self.target),
-            )
-        )
 
 
 def conclude(
@@ -141,10 +98,22 @@ def conclude(
         0.5 * spacing,
         steps,
     )
-    best, curvature = jax.tree.map(lambda x: x[0], (evidence, curvatures))
+    best = jax.tree.map(lambda x: x[0], evidence)
+    enough = log_evidence[0] >= min_log_evidence
+    if steps and pair.source.fine is not None:
+        first = T_modes[0], jax.tree.map(lambda x: x[0], curvatures)
+        last = lax.cond(
+            sound[0] & enough,
+            lambda first: last_digits(pair, kernel, first[0], 0.5 * spacing),
+            lambda first: first,
+            first,
+        )
+        T_modes, curvatures = jax.tree.map(
+            lambda x, y: x.at[0].set(y), (T_modes, curvatures), last
+        )
+    curvature = jax.tree.map(lambda x: x[0], curvatures)
     doubtful = ~best.grip.holds | _has_rival(log_evidence)
     finished = finished | (refine_steps > 0)
-    enough = log_evidence[0] >= min_log_evidence
     status = _status(sound[0], enough, doubtful, pair, finished)
     return RegistrationSolution(
         T_target_source=T_modes[0],
