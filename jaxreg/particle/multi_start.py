@@ -39,7 +39,7 @@ class MultiStart(AbstractSearch):
             and shifts none by more than so many radii (the target's root mean square
             radius).
         min_log_evidence: of less `log_evidence` than this the status is LOW_OVERLAP. At
-            the default one in a hundred pairs of scans that do not overlap is believed
+            the default 262 of 272 right answers were believed and none of 136 wrong ones
             (bench/studies/evidence.md).
 
     Raises: ValueError while constructing, for counts that leave nothing to do.

@@ -161,7 +161,7 @@ def test_steps_that_run_out_early_end_with_all_points():
     # Enough points that a descent begins with some of them.
     source, T = blob(2000, 3, seed=1), motion(3, 3, angle=0.6)
     target = move(T, blob(2000, 3, seed=2))
-    sol = jr.register(source, target, jr.ICP(max_steps=2), init=np.eye(4))
+    sol = jr.register(source, target, jr.ICP(max_steps=3), init=np.eye(4))
     assert int(sol.status) == Status.MAX_STEPS
     start, _ = pose_error(jnp.eye(4), T)
     angle, _ = pose_error(sol.T_target_source, T)
