@@ -17,7 +17,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("geometry",),
     ("neighbours", "graph"),
     ("cloud", "averaging.trace", "datasets", "metrics"),
-    ("matching", "averaging.measures"),
+    ("matching", "features", "averaging.measures"),
     ("registrar", "averaging.likelihood"),
     ("averaging.base",),
     ("local", "averaging.steps"),

@@ -149,9 +149,12 @@ class Witness(eqx.Module):
     @classmethod
     def of_some(cls, source: PointCloud, target: PointCloud) -> "Witness":
         """Of some points of clouds that have no index: all pairs are compared."""
-        clouds = [cloud.spread(_SOME).with_spacing() for cloud in (source, target)]
-        indexes = (BruteForce.build(cloud.points, cloud.mask) for cloud in clouds)
-        return cls.of(*clouds, *indexes)
+        source = source.spread(_SOME).with_spacing()
+        target = target.spread(_SOME).with_spacing()
+        index = BruteForce.build(source.points, source.mask)
+        return cls.of(
+            source, target, index, BruteForce.build(target.points, target.mask)
+        )
 
     def of_poses(
         self, T_target_source: Float[Array, "q D D"], used: Bool[Array, " q"]
@@ -254,7 +257,8 @@ class _Mixture(eqx.Module):
             return jnp.stack([share, width, jnp.clip(alike, _LEAST_ALIKE, _MOST_ALIKE)])
 
         start = jnp.asarray(_START, weight.dtype)
-        return cls(*lax.fori_loop(0, _FIT_STEPS, improve, start), d)
+        share, width, alike = lax.fori_loop(0, _FIT_STEPS, improve, start)
+        return cls(share, width, alike, d)
 
     def log_odds(self, beside: _Beside) -> Float[Array, " n"]:
         """Of each point lying on the surface."""

@@ -29,10 +29,11 @@ from jaxreg.neighbours import (
     VoxelTable,
     check_index,
 )
-from jaxreg.particle.conclude import conclude
+from jaxreg.particle.conclude import APART, conclude
 from jaxreg.particle.energies import AbstractEnergy
 from jaxreg.particle.pair import Pair
 from jaxreg.particle.priors import AbstractPrior, GaussianPrior, UniformPrior
+from jaxreg.particle.proposals import propose_modes
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import (
     AbstractIndexedRegistrar,
@@ -60,12 +61,14 @@ class Found(eqx.Module):
         particles: measured poses, with energies and weights.
         num_steps: int32, steps of the local optimiser along the path of one of them.
         finished: whether they had come to rest.
+        sure: whether there is no need to look for other poses.
         trace: of the steps of a filter.
     """
 
     particles: Particles
     num_steps: Int[Array, ""]
     finished: Bool[Array, ""]
+    sure: Bool[Array, ""]
     trace: SearchTrace | None = None
 
 
@@ -83,6 +86,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
     num_points: eqx.AbstractVar[int]
     index: eqx.AbstractVar[IndexBuilder | None]
     refine_steps: eqx.AbstractVar[int]
+    num_proposals: eqx.AbstractVar[int]
     max_points: eqx.AbstractVar[int]
     batch_size: eqx.AbstractVar[int]
 
@@ -98,7 +102,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
         )
         check_index(self)
         check_counts(self, num_points=1, num_modes=1, max_points=1, batch_size=1)
-        check_counts(self, refine_steps=0)
+        check_counts(self, refine_steps=0, num_proposals=0)
         check_positive(self, "width_start", "width_end")
         check_not_negative(self, "tolerance")
 
@@ -191,12 +195,30 @@ class AbstractSearch(AbstractIndexedRegistrar):
             found.particles,
             found.num_steps,
             found.finished,
+            self._proposals(pair, found.sure, init),
             kernel=self.kernel,
             num_modes=self.num_modes,
             refine_steps=self.refine_steps,
             min_log_evidence=self.min_log_evidence,
         )
         return dataclasses.replace(solution, trace=found.trace)
+
+    def _proposals(
+        self, pair: Pair, sure: Bool[Array, ""], init: Motion | None
+    ) -> tuple[Float[Array, "r 4 4"], Bool[Array, " r"]] | None:
+        """Poses of local features and which are in use, where any may be the answer."""
+        anywhere = self.prior is None and init is None
+        judged = self.refine_steps > 0 and pair.source.points.shape[1] == 3
+        if not (self.num_proposals and anywhere and judged):
+            return None
+        return propose_modes(
+            pair.source,
+            pair.target,
+            pair.spacing,
+            self.num_proposals,
+            apart=jnp.asarray(APART, pair.source.points.dtype),
+            wanted=~sure,
+        )
 
     def optimiser(self, dtype: Any) -> LocalOptimiser:
         """Residual x kernel x step, in a dtype."""

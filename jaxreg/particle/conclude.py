@@ -15,6 +15,7 @@ from jaxreg.geometry import lie
 from jaxreg.local import Curvature, GaussNewton, LocalOptimiser
 from jaxreg.matching import (
     NO_EVIDENCE,
+    Evidence,
     PlaneToPlane,
     PointToPlane,
     Problem,
@@ -28,12 +29,14 @@ from jaxreg.registrar import Modes, RegistrationSolution
 from jaxreg.robust import AbstractKernel
 
 
-# Poses nearer than this, in radians and radii, are one mode.
-_APART = 0.3
+#: Poses nearer than this, in radians and radii, are one mode.
+APART = 0.3
 #: A second mode is a rival of the first if its log evidence falls short of the first's
 #: by less than this. (Poses that a symmetry makes equal differ by 0.25 at most, in 108
 #: pairs of cubes, boxes, prisms and tori of 500 to 4,000 points, with noise or not.)
 RIVAL_MARGIN = 0.5
+# Proposals that share less of the source are not judged.
+_LEAST_SHARED = 1 / 7
 # Modes of so much less evidence than the first are not worth the last steps.
 _HOPELESS = 6.0
 # Steps of the most accurate residual, where it is close already.
@@ -48,6 +51,7 @@ def conclude(
     particles: Particles,
     num_steps: Int[Array, ""],
     finished: Bool[Array, ""],
+    proposals: tuple[Float[Array, "r D D"], Bool[Array, " r"]] | None = None,
     *,
     kernel: AbstractKernel,
     num_modes: int,
@@ -61,24 +65,32 @@ def conclude(
         particles: measured and weighted poses.
         num_steps: steps of the local optimiser that led to them.
         finished: whether they had come to rest.
+        proposals: more poses to refine and judge, and which are in use; they count
+            where surfaces hold them and a seventh of the source is shared.
         kernel: of the refinement.
-        num_modes: distinct poses to refine and judge.
+        num_modes: distinct poses of the particles to refine and judge; of these and the
+            proposals the solution has as many.
         refine_steps: steps on all points; the modes are then ordered by their
             evidence. Without, by energy: the answer is the particle of least energy.
         min_log_evidence: of less the status is LOW_OVERLAP.
     """
     dtype = particles.energy.dtype
-    limit = jnp.asarray(_APART, dtype)
+    limit = jnp.asarray(APART, dtype)
     rows, mass = distinct_modes(particles, num_modes, angle=limit, distance=limit)
     spacing, exact = pair.spacing, pair.exact
     witness = exact.witness
     T_modes = particles.T_target_source[rows]
+    if proposals is not None:
+        T_more, in_use = proposals
+        T_modes = jnp.concatenate([T_modes, T_more])
+        mass = jnp.concatenate([mass, in_use.astype(dtype)])
     T_modes, sound = _refined(
         pair.problem, kernel, T_modes, mass > 0, spacing, refine_steps
     )
     evidence = witness.of_poses(T_modes, sound)
-    by_evidence = jnp.argsort(-evidence.log_evidence)
-    order = by_evidence if refine_steps else jnp.arange(num_modes)
+    sound = sound & ((jnp.arange(len(sound)) < num_modes) | _convincing(evidence))
+    by_evidence = jnp.argsort(-jnp.where(sound, evidence.log_evidence, NO_EVIDENCE))
+    order = by_evidence[:num_modes] if refine_steps else jnp.arange(num_modes)
     T_modes, mass, sound, evidence = jax.tree.map(
         lambda x: x[order], (T_modes, mass, sound, evidence)
     )
@@ -112,7 +124,8 @@ def conclude(
             lambda x, y: x.at[0].set(y), (T_modes, curvatures), last
         )
     curvature = jax.tree.map(lambda x: x[0], curvatures)
-    doubtful = ~best.grip.holds | _has_rival(log_evidence)
+    holds = evidence.grip.holds
+    doubtful = ~holds[0] | _has_rival(log_evidence, holds)
     finished = finished | (refine_steps > 0)
     status = _status(sound[0], enough, doubtful, pair, finished)
     return RegistrationSolution(
@@ -140,9 +153,26 @@ def conclude(
     )
 
 
-def _has_rival(log_evidence: Float[Array, " q"]) -> Bool[Array, ""]:
-    """Whether another mode is about as likely as the first."""
-    return jnp.any(log_evidence[1:] > log_evidence[0] - RIVAL_MARGIN)
+def _convincing(evidence: Evidence) -> Bool[Array, " q"]:
+    """Which proposals count: those that are held, and by more than a patch.
+
+    Particles descend to where clouds share much; the evidence was learned there.
+    Features find small patches that fit each other as if they were the same: 9 % of
+    two scans of opposite sides of the sculpture.
+    """
+    return evidence.grip.holds & (evidence.overlap >= _LEAST_SHARED)
+
+
+def _has_rival(
+    log_evidence: Float[Array, " q"], holds: Bool[Array, " q"]
+) -> Bool[Array, ""]:
+    """Whether another mode is about as likely as the first.
+
+    One that can slip rivals only a first that can: walls fit on walls and slide along
+    them, which is evidence of walls but not of a pose.
+    """
+    likely = log_evidence[1:] > log_evidence[0] - RIVAL_MARGIN
+    return jnp.any(likely & (holds[1:] | ~holds[0]))
 
 
 def _weights(

@@ -7,7 +7,9 @@
 
 A measurement is a few steps of a local optimiser; what it moved a particle by is the
 particle's motion error, whose size and direction the next diffusion takes. The
-distinct poses that are left are refined by many steps on more points and scored.
+distinct poses that are left are refined by many steps on more points and scored; beside
+them, in 3D, a few that local features propose (`proposals`): where clouds share little,
+wrong poses may have less energy than the right one, and the evidence decides.
 
 Every choice is a part. The defaults are not all the paper's: many more particles are
 drawn at t = 0 than are carried on; the energy is bounded and asks that normals agree,
@@ -17,6 +19,7 @@ paper's own.
 """
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxreg._core.arrays import traced
@@ -58,6 +61,11 @@ class ParticleFilter(AbstractFilter):
             the particle of least energy, as in the paper.
         num_points: source points that a particle is measured on.
         num_modes: distinct poses that are refined and returned.
+        num_proposals: distinct poses, in 3D, that local features agree on and that are
+            refined beside the modes (`jaxreg.features`). Asked for where neither `init`
+            nor a prior is given and the draws were not sure; with zero never, nor
+            without refinement. They count where a seventh of the source is shared and
+            its surfaces hold the pose.
         num_agreeing: the draws end, and the search, as soon as so many of them have
             settled at the best pose and none elsewhere nearly as well; with zero, or an
             energy that is not bounded, all are drawn and none is settled, as in the
@@ -82,15 +90,15 @@ class ParticleFilter(AbstractFilter):
             shifts by more than so many radii (the target's root mean square radius):
             then the diffusion has died.
         min_log_evidence: of less `log_evidence` than this the status is LOW_OVERLAP. At
-            the default 262 of 272 right answers were believed and none of 136 wrong ones
-            (bench/studies/evidence.md).
+            the default 262 of 272 right answers were believed, and none of 136 wrong
+            ones (bench/studies/evidence.md).
 
     Raises: ValueError while constructing, for counts that leave nothing to do.
 
     Fails: TOO_FEW_POINTS; NON_FINITE where no energy is finite; LOW_OVERLAP where the
     evidence is below `min_log_evidence`; AMBIGUOUS where a second mode is as likely,
-    or where the surfaces that agree can slip, as those of a cylinder; without
-    refinement MAX_STEPS where the diffusion had not died.
+    unless it can slip, or where the surfaces that agree can slip, as those of a
+    cylinder; without refinement MAX_STEPS where the diffusion had not died.
 
     Gradients: none; refine with `ICP` from the answer to differentiate it.
     """
@@ -103,6 +111,7 @@ class ParticleFilter(AbstractFilter):
     refine_steps: int = eqx.field(default=24, static=True)
     num_points: int = eqx.field(default=400, static=True)
     num_modes: int = eqx.field(default=16, static=True)
+    num_proposals: int = eqx.field(default=4, static=True)
     num_agreeing: int = eqx.field(default=4, static=True)
     max_points: int = eqx.field(default=4096, static=True)
     batch_size: int = eqx.field(default=32, static=True)
@@ -172,8 +181,9 @@ class ParticleFilter(AbstractFilter):
         state, trace = ended.state
         particles = state.particles.rows(slice(self.num_particles))
         steps = self.prior_steps + state.num_steps * self.inner_steps
+        sure = jnp.asarray(False)
         if state.settled is not None:
             sure = state.num_steps == 0
             particles = with_settled(state.settled, particles, sure)
             steps = steps + SETTLE_STEPS
-        return Found(particles, steps, ended.converged, trace)
+        return Found(particles, steps, ended.converged, sure, trace)

@@ -32,6 +32,7 @@ class MultiStart(AbstractSearch):
         num_steps: local steps from each.
         refine_steps, num_points, num_modes, max_points, batch_size: as in
             `ParticleFilter`.
+        num_proposals: as there, but none by default.
         prior, energy, residual, kernel, step, index: as there. The energy ranks the
             ends, of which a mode's weight is its share.
         width_start, width_end: kernel width at the first and at the last step.
@@ -39,8 +40,8 @@ class MultiStart(AbstractSearch):
             and shifts none by more than so many radii (the target's root mean square
             radius).
         min_log_evidence: of less `log_evidence` than this the status is LOW_OVERLAP. At
-            the default 262 of 272 right answers were believed and none of 136 wrong ones
-            (bench/studies/evidence.md).
+            the default 262 of 272 right answers were believed, and none of 136 wrong
+            ones (bench/studies/evidence.md).
 
     Raises: ValueError while constructing, for counts that leave nothing to do.
 
@@ -54,6 +55,7 @@ class MultiStart(AbstractSearch):
     refine_steps: int = eqx.field(default=24, static=True)
     num_points: int = eqx.field(default=400, static=True)
     num_modes: int = eqx.field(default=16, static=True)
+    num_proposals: int = eqx.field(default=0, static=True)
     max_points: int = eqx.field(default=4096, static=True)
     batch_size: int = eqx.field(default=32, static=True)
     prior: AbstractPrior | None = None
@@ -104,4 +106,5 @@ class MultiStart(AbstractSearch):
             found,
         )
         finished = jnp.max(jnp.abs(particles.motion_error)) <= self.tolerance
-        return Found(particles, jnp.asarray(self.num_steps, jnp.int32), finished)
+        steps = jnp.asarray(self.num_steps, jnp.int32)
+        return Found(particles, steps, finished, jnp.asarray(False))

@@ -4,8 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.matching import NO_EVIDENCE
-from jaxreg.particle.conclude import _has_rival, _weights
+from jaxreg.matching import NO_EVIDENCE, Evidence
+from jaxreg.matching.slippage import Grip
+from jaxreg.particle.conclude import _convincing, _has_rival, _weights
 
 
 def _weighed(*log_evidence: float) -> np.ndarray:
@@ -31,8 +32,32 @@ def test_modes_in_use_keep_some_weight_and_the_others_none():
 
 
 @pytest.mark.parametrize(
-    ("log_evidence", "rival"),
-    [((5.0, 3.9), False), ((5.0, 4.1), True), ((5.0, NO_EVIDENCE), False)],
+    ("log_evidence", "holds", "rival"),
+    [
+        ((5.0, 3.9), (True, True), False),
+        ((5.0, 4.1), (True, True), True),
+        ((5.0, NO_EVIDENCE), (True, False), False),
+        # What slides along a wall rivals no pose that is held, but one that slides.
+        ((5.0, 4.1), (True, False), False),
+        ((5.0, 4.1, 4.2), (True, False, True), True),
+        ((5.0, 4.1), (False, False), True),
+    ],
 )
-def test_a_mode_is_a_rival_if_it_is_nearly_as_likely(log_evidence, rival):
-    assert bool(_has_rival(jnp.asarray(log_evidence, jnp.float32))) == rival
+def test_a_mode_is_a_rival_if_it_is_nearly_as_likely_and_holds(
+    log_evidence, holds, rival
+):
+    found = _has_rival(jnp.asarray(log_evidence, jnp.float32), jnp.asarray(holds))
+    assert bool(found) == rival
+
+
+@pytest.mark.parametrize(
+    ("overlap", "held", "counts"),
+    [(0.2, True, True), (0.1, True, False), (0.2, False, False)],
+)
+def test_proposals_count_if_they_share_enough_and_hold(overlap, held, counts):
+    # Planes of all directions about the origin, or of one.
+    H = np.eye(6) if held else np.diag([1.0, 0, 0, 0, 0, 0])
+    grip = Grip(*(jnp.asarray(x, jnp.float32) for x in (H, np.zeros(3), 1.0)))
+    zero = jnp.zeros((), jnp.float32)
+    evidence = Evidence(zero, zero + overlap, zero, zero, jnp.zeros((), int), grip)
+    assert bool(_convincing(evidence)) == counts

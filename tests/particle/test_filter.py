@@ -37,9 +37,10 @@ from jaxreg.particle import (
     Systematic,
     sandhu2010,
 )
-from jaxreg.particle.conclude import Pair, conclude
+from jaxreg.particle.conclude import conclude
 from jaxreg.particle.draw import SETTLE_STEPS
 from jaxreg.particle.energies import AbstractEnergy
+from jaxreg.particle.pair import Pair
 from jaxreg.registration import register
 from jaxreg.robust import L2
 
