@@ -36,9 +36,9 @@ def test_the_closest_point_within_the_radius_is_found(d):
         np.testing.assert_allclose(mine[near], least[near], rtol=1e-5)
         assert np.asarray(found.valid)[near].all()
         assert not np.asarray(found.valid)[least > reach * (1 + 1e-5)].any()
-        # The table's answer is where the search begins.
-        table = true[np.arange(N), np.asarray(coarse)]
-        assert np.all(mine <= table * (1 + 1e-5))
+        # So few targets answer coarsely all of them, near or far.
+        closest = true[np.arange(N), np.asarray(coarse)]
+        np.testing.assert_allclose(closest, least, rtol=1e-5, atol=1e-6 * scale)
 
     check()
 

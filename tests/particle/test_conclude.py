@@ -34,13 +34,13 @@ def test_modes_in_use_keep_some_weight_and_the_others_none():
 @pytest.mark.parametrize(
     ("log_evidence", "holds", "rival"),
     [
-        ((5.0, 3.9), (True, True), False),
-        ((5.0, 4.1), (True, True), True),
+        ((5.0, 4.4), (True, True), False),
+        ((5.0, 4.6), (True, True), True),
         ((5.0, NO_EVIDENCE), (True, False), False),
         # What slides along a wall rivals no pose that is held, but one that slides.
-        ((5.0, 4.1), (True, False), False),
-        ((5.0, 4.1, 4.2), (True, False, True), True),
-        ((5.0, 4.1), (False, False), True),
+        ((5.0, 4.6), (True, False), False),
+        ((5.0, 4.6, 4.7), (True, False, True), True),
+        ((5.0, 4.6), (False, False), True),
     ],
 )
 def test_a_mode_is_a_rival_if_it_is_nearly_as_likely_and_holds(

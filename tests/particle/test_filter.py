@@ -377,6 +377,6 @@ def test_pieces_of_smooth_surfaces_are_found_without_a_guess():
         angle, _ = pose_error(sol.T_target_source[k], T)
         assert angle < 0.05
     assert np.all(np.asarray(sol.status) == Status.CONVERGED)
-    np.testing.assert_allclose(sol.modes.margin, 1, atol=0.05)
-    np.testing.assert_allclose(sol.modes.effective_size, 1, atol=0.05)
+    assert np.all(np.asarray(sol.modes.margin) > 1 / 3)
+    assert np.all(np.asarray(sol.modes.effective_size) < 3)
     np.testing.assert_array_equal(sol.modes.covariance[:, 0], sol.covariance)
