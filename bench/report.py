@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench import plots, records
+from bench.pair_table import pair_table
 from bench.records import Metric, Records, Row
 from bench.workloads import WORKLOADS
 
@@ -99,10 +100,12 @@ def _section(section: Section, pictures: list[Path]) -> Iterator[str]:
     yield f"{known.text}\n\n`{command}`\n"
     for path in pictures:
         yield f"![{path.stem}](plots/{path.name})\n"
+    if known.pairs:
+        yield from pair_table(section.rows)
     by_case = groupby(
         sorted(section.rows, key=_order(section.rows)), key=lambda r: r.key.case
     )
-    for case, rows in by_case:
+    for case, rows in by_case if not known.pairs else ():
         yield from _table(case, list(rows))
     yield "<details><summary>Parameters</summary>\n"
     told = dict.fromkeys((r.key.method, r.parameters) for r in section.rows)

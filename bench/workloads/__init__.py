@@ -17,6 +17,7 @@ class Workload(NamedTuple):
         double: whether JAX computes in float64 where asked.
         quick: whether it has cases of `--quick`.
         devices: whether each core is a device of JAX, or all of them one.
+        pairs: whether its cases are pairs, told in one table.
     """
 
     title: str
@@ -25,6 +26,7 @@ class Workload(NamedTuple):
     double: bool = False
     quick: bool = True
     devices: bool = False
+    pairs: bool = False
 
 
 WORKLOADS = {
@@ -56,6 +58,33 @@ WORKLOADS = {
         "prepared once, apart from the time of a pair. Right: within 5 degrees and 5 "
         "mm at the source's centroid. Believed: what the method itself reports as "
         "found.",
+        quick=False,
+    ),
+    "sensor_pairs": Workload(
+        "Pairs of other people's sensors",
+        "Lidars, depth cameras and objects of other projects, no guess, three keys. "
+        "What is timed runs from NumPy points to a pose. Right: within 5 degrees and "
+        "the tolerance of the data at the source's centroid. Believed: status "
+        "CONVERGED; of peers, more than 0.3 of the points of either cloud within 1.5 "
+        "voxels of the other.",
+        cores="all",
+        quick=False,
+        pairs=True,
+    ),
+    "sensor_guesses": Workload(
+        "Pairs of other people's sensors, locally",
+        "Those of the pairs above for which a guess is published, from that guess. "
+        "webots is 60 degrees from it. Right and believed as above.",
+        cores="all",
+        quick=False,
+        pairs=True,
+    ),
+    "sensor_sequences": Workload(
+        "Sequences of other people's sensors",
+        "Scans of a lidar that moves into one frame, no guess. `placed`: scans of the "
+        "largest group; `wrong`: those beyond 5 degrees and 0.6 m; `e_R`, `e_t`: mean "
+        "errors in the frame of its first scan; all of the worst of three keys.",
+        cores="all",
         quick=False,
     ),
     "look_ups": Workload(

@@ -1,0 +1,77 @@
+"""What the evidence is made of, of each mode that `register` finds."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from bench.studies.evidence_pairs import Pair
+from jaxreg import ParticleFilter, Status, register
+from jaxreg.geometry import lie
+from jaxreg.matching import evidence
+from jaxreg.neighbours import BruteForce
+from jaxreg.particle.conclude import Pair as Prepared
+from jaxreg.registrar import prepare_pair
+
+
+# Sizes that clouds are padded to: each is compiled once.
+_SIZES = 8192, 32768, 49152, 98304, 327680
+
+
+def modes_of(pair: Pair, key: int) -> dict[str, Any]:
+    """Modes with log gain, near, and errors in degrees and tolerances; for JSON."""
+    *clouds, source_mask, target_mask = padded(pair.source, pair.target)
+    masks = {"source_mask": source_mask, "target_mask": target_mask}
+    found = register(*clouds, key=jax.random.key(key), **masks)
+    T = found.modes.T_target_source
+    numbers = found.modes.log_evidence, *_numbers((*clouds, *masks.values()), T)
+    told = zip(*map(np.asarray, numbers), strict=True)
+    names = "log_evidence", "log_gain", "near", "degrees", "tolerances"
+    modes = [
+        dict(zip(names, map(float, (*three, *pair.errors(pose))), strict=True))
+        for three, pose, weight in zip(
+            told, np.asarray(T, float), np.asarray(found.modes.weight), strict=True
+        )
+        if weight > 0
+    ]
+    return {
+        "pair": pair.name,
+        "key": key,
+        "status": Status(int(found.status)).name,
+        "log_evidence": float(found.log_evidence),
+        "overlap": float(found.overlap),
+        "modes": modes,
+    }
+
+
+def padded(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Clouds of one of a few sizes, and their masks."""
+    num = next(n for n in _SIZES if n >= max(len(source), len(target)))
+    clouds, masks = [], []
+    for points in (source, target):
+        points = np.asarray(points, np.float32)
+        points = points[np.isfinite(points).all(axis=1)]
+        clouds.append(np.pad(points, ((0, num - len(points)), (0, 0))))
+        masks.append(np.arange(num) < len(points))
+    return *clouds, *masks
+
+
+@eqx.filter_jit
+def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`(q,)` log gain and near of poses `(q, 4, 4)`, as the evidence has them."""
+    ready = prepare_pair(ParticleFilter(), tuple(map(jnp.asarray, clouds)))
+    pair = ready.source, ready.target
+    indexes = (BruteForce.build(cloud.points, cloud.mask) for cloud in pair)
+    witness = Prepared(*pair, *indexes).exact.witness
+    (there, back), (own, other) = witness.problems, witness.spacings
+
+    def of_pose(T: jax.Array) -> tuple[jax.Array, jax.Array]:
+        to = evidence._one_way(there, T, own, other, witness.shares[0])
+        fro = evidence._one_way(back, lie.inverse(T), other, own, witness.shares[1])
+        gain = jnp.maximum((to.gain + fro.gain) / 2, evidence._LEAST_GAIN)
+        return jnp.log(gain), jnp.sqrt(to.near * fro.near)
+
+    return lax.map(of_pose, jax.vmap(ready.frames.enter)(T))

@@ -1,0 +1,94 @@
+"""Sequences of other people's lidars into one frame, without a guess."""
+
+from collections.abc import Iterator
+from functools import partial
+
+import jax
+import numpy as np
+
+from bench.case import Case, Judged, Method, Options
+from bench.peers.multiview import Multiway
+from bench.records import Metric, error
+from bench.workloads.multiview import PEER, peer_method
+from bench.workloads.sensor_data import Sequence, pose_errors, sequences
+from jaxreg import reconstruct
+
+
+# A scan so far from where it belongs, in degrees and metres, is wrong.
+_WRONG = 5.0, 0.6
+#: Number of the connected group of each scan, negative of none; and poses.
+Placed = tuple[np.ndarray, np.ndarray]
+
+
+def cases(options: Options) -> Iterator[Case]:
+    """A case per sequence."""
+    for data in sequences(options.data):
+        peer = Multiway(
+            data.voxel,
+            0.4 * data.voxel,
+            data.least,
+            camera_at_origin=data.camera_at_origin,
+        )
+        own = [
+            Method(
+                f"jaxreg reconstruct, {order}",
+                "jaxreg",
+                f"order={order!r}",
+                partial(by_reconstruct, order, data.scans),
+            )
+            for order in ("any", "sequential")
+        ]
+        yield Case(
+            name=data.name,
+            data=f"{len(data.scans)} scans of {len(data.scans[0])} points",
+            methods=[*own, peer_method(peer, partial(by_peer, peer, data.scans))],
+            trials=[(seed,) for seed in range(3)],
+            judge=partial(judge, data),
+            long=True,
+            reference=PEER,
+        )
+
+
+def by_reconstruct(order, scans: list[np.ndarray], seed: int) -> Placed:
+    """As a user calls it."""
+    found = reconstruct(scans, order=order, key=jax.random.key(seed))
+    component = np.where(np.asarray(found.placed), np.asarray(found.component), -1)
+    return component, np.asarray(found.T_world_i, float)
+
+
+def by_peer(peer: Multiway, scans: list[np.ndarray], seed: int) -> Placed:
+    """The same of Open3D."""
+    T = peer.solve(scans, seed)
+    return np.where(np.isnan(T[:, 0, 0]), -1, 0), T
+
+
+def judge(data: Sequence, answers: list[Placed]) -> Judged:
+    """Scans of the largest group, and their errors; the worst of the keys.
+
+    Errors are means over those scans in the frame of the first of them, of the turn and
+    of the distance at the scan's centroid.
+    """
+    placed, wrong, turns, shifts = [], [], [], []
+    for component, T in answers:
+        some = component[component >= 0]
+        largest = np.bincount(some).argmax() if len(some) else 0
+        ids = np.flatnonzero(component == largest)
+        both = np.array([_error(data, T, ids[0], i) for i in ids[1:]]).reshape(-1, 2)
+        placed.append(len(ids))
+        wrong.append(np.sum(np.any(both > _WRONG, axis=1)))
+        turns.append(np.radians(both[:, 0].mean()) if len(both) else np.inf)
+        shifts.append(1e3 * both[:, 1].mean() if len(both) else np.inf)
+    return Judged(
+        [
+            Metric("placed", float(min(placed)), "scans", "up", 0.0),
+            Metric("wrong", float(max(wrong)), "scans", "down", 0.0),
+            error("e_R", float(max(turns)), "rad", 2e-4),
+            error("e_t", float(max(shifts)), "mm", 1.0),
+        ]
+    )
+
+
+def _error(data: Sequence, T: np.ndarray, first: int, scan: int) -> tuple[float, float]:
+    """Degrees and metres of a scan in the frame of another."""
+    found, true = (np.linalg.inv(x[first]) @ x[scan] for x in (T, data.T_world_i))
+    return pose_errors(data.scans[scan], found, true)
