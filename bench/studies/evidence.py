@@ -25,6 +25,7 @@ from bench.studies.evidence_modes import modes_of
 from bench.studies.evidence_pairs import GENERATED, KINDS
 from bench.studies.reliability import Reliability, draw
 from jaxreg.matching import evidence
+from jaxreg.particle.conclude import RIVAL_MARGIN
 
 
 # Keys of a pair.
@@ -178,11 +179,14 @@ def _read(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _examples(rows: list[dict[str, Any]]) -> Examples:
-    """The best right and the best wrong mode of each pair, of its first key."""
+    """The best right and the best wrong mode of each pair, of its first key.
+
+    An answer that slides is neither: its surfaces coincide wherever it slides to.
+    """
     numbers, right, pair = [], [], []
     first = [row for row in rows if row["key"] == 0]
     for at, row in enumerate(first):
-        ordered = sorted(row["modes"], key=lambda m: -m["log_evidence"])
+        ordered = row["modes"][1:] if _slides(row) else row["modes"]
         for wanted, some in (
             (1.0, [m for m in ordered if _is_right(m)]),
             (0.0, [m for m in ordered if _is_wrong(m)]),
@@ -192,6 +196,13 @@ def _examples(rows: list[dict[str, Any]]) -> Examples:
                 right.append(wanted)
                 pair.append(at)
     return Examples(np.array(numbers), np.array(right), np.array(pair))
+
+
+def _slides(row: dict[str, Any]) -> bool:
+    """Whether the answer is ambiguous without a rival: its surfaces do not hold it."""
+    first, *others = (mode["log_evidence"] for mode in row["modes"])
+    rival = any(other > first - RIVAL_MARGIN for other in others)
+    return row["status"] == "AMBIGUOUS" and not rival
 
 
 def _is_right(mode: dict[str, float]) -> bool:

@@ -23,11 +23,17 @@ _SIZES = 8192, 32768, 49152, 98304, 327680
 
 def modes_of(pair: Pair, key: int) -> dict[str, Any]:
     """Modes with log gain, near, and errors in degrees and tolerances; for JSON."""
-    *clouds, source_mask, target_mask = padded(pair.source, pair.target)
-    masks = {"source_mask": source_mask, "target_mask": target_mask}
-    found = register(*clouds, key=jax.random.key(key), **masks)
+    clouds = padded(pair.source, pair.target)
+    source, target, *masks = clouds
+    found = register(
+        source,
+        target,
+        key=jax.random.key(key),
+        source_mask=masks[0],
+        target_mask=masks[1],
+    )
     T = found.modes.T_target_source
-    numbers = found.modes.log_evidence, *_numbers((*clouds, *masks.values()), T)
+    numbers = found.modes.log_evidence, *_numbers(clouds, T)
     told = zip(*map(np.asarray, numbers), strict=True)
     names = "log_evidence", "log_gain", "near", "degrees", "tolerances"
     modes = [

@@ -21,7 +21,7 @@ from bench.workloads.sensor_data import Answer, Sequence
 
 def _shifted(x: float) -> np.ndarray:
     T = np.eye(4)
-    T[0, 3] = x
+    T[:3, 3] = x, 0, 0
     return T
 
 
@@ -33,7 +33,7 @@ def data(tmp_path: Path) -> Path:
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     known = {
         "source": points,
-        "target": points[:40] + np.float32([2, 0, 0]),
+        "target": points[:40] + np.array([2, 0, 0], np.float32),
         "T_target_source": _shifted(2),
         "tolerance": 0.1,
         "kind": "lidar",
@@ -43,7 +43,7 @@ def data(tmp_path: Path) -> Path:
     }
     np.savez(folder / "a.npz", **known)
     np.savez(folder / "b.npz", **known, T_init=_shifted(1.5))
-    scans = {"scan_00": points, "scan_01": points + np.float32([0, 1, 0])}
+    scans = {"scan_00": points, "scan_01": points + np.array([0, 1, 0], np.float32)}
     poses = np.stack([np.eye(4), _shifted(1)])
     told = {"voxel": 0.5, "least": 0.3, "camera_at_origin": True}
     np.savez(folder / "seq_c.npz", T_world_i=poses, **scans, **told)
@@ -61,7 +61,8 @@ def test_cases_are_those_of_the_files(data: Path):
 def test_answers_are_right_within_the_tolerance_and_counted_if_believed(data: Path):
     case = next(iter(sensor_pairs.cases(Options(quick=False, data=data))))
     poses = _shifted(2.05), _shifted(2.05), _shifted(2.2)
-    told = [Answer(T, b, 0.5, 1.0) for T, b in zip(poses, (1, 0, 1), strict=True)]
+    believed = True, False, True
+    told = [Answer(T, b, 0.5, 1.0) for T, b in zip(poses, believed, strict=True)]
     judged = case.judge(told)
     found = {m.key: m.value for m in judged.metrics}
     assert found["right"] == pytest.approx(200 / 3)
