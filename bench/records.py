@@ -3,7 +3,8 @@
 A file holds JSON lines. A line of kind "run" names the machine, its threads, the
 versions and the command; a line of kind "row" is one method on one case and points to
 its run. Files are only ever appended to, so that what is finished stays; of rows with
-the same key the last counts.
+the same key the last counts. A metric carries its unit, direction and tolerance, which
+no column of a data frame does: hence classes, and no pandas.
 """
 
 import json

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from bench.peers.pose_graphs import Found
-from bench.workloads.command_line import judge_scans
 from bench.workloads.false_closures import closures, judge, with_false_closures
 from bench.workloads.filter_data import cube, horse, horse_model
 from bench.workloads.filter_paper import judge as judge_poses
@@ -48,23 +47,6 @@ def test_a_pose_that_looks_the_same_is_told_apart_from_the_right_one():
     judged = judge_poses(trials, [*truth[:2], *(quarter @ truth[2:4]), np.eye(4)])
     found = {m.key: m.value for m in judged.metrics}
     assert (found["success"], found["as_shape"]) == (40, 80)
-
-
-def test_scans_are_judged_by_the_worst_seed_and_errors_in_millimetres():
-    def document(placed: list[bool], e_t: float) -> dict:
-        return {
-            "scans": [{"placed": x} for x in placed],
-            "errors": {"mean_e_R": 0.01, "mean_e_t": e_t},
-            "times_s": {"compile": 3.0, "run": 2.0, "write": 1.0},
-        }
-
-    lost = [True, True, True, False]
-    answers = [document([True] * 4, 0.001), document(lost, 0.002)]
-    answers.append(document([True] * 4, 0.009))
-    found = {m.key: m.value for m in judge_scans(answers).metrics}
-    assert found == {
-        "placed": 75, "e_R": 0.01, "e_t": 2.0, "compile": 3.0, "run": 2.0
-    }  # fmt: skip
 
 
 def test_errors_are_distances_and_counts_are_of_closures():

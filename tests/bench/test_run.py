@@ -7,7 +7,7 @@ from types import ModuleType
 
 import pytest
 
-from bench import records, run, worker
+from bench import records, worker
 from bench.case import Case, Judged, Method, Options
 from bench.measure import blank_row, measure
 from bench.peers import PEERS
@@ -141,19 +141,3 @@ def test_finished_rows_are_kept_and_resume_goes_on(fake):
     }
     worker.main(task | {"run": "third"})
     assert {r.run for r in records.read(path).rows.values()} == {"third"}
-
-
-def test_a_method_that_kills_its_process_is_a_row(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
-    ends = iter(["its process ended with code -11", ""])
-
-    def process(command, environment, running: Path, longest, stop) -> str:
-        running.write_text('{"case": "two", "method": "theirs", "library": "open3d"}')
-        return next(ends)
-
-    monkeypatch.setattr(run, "_process", process)
-    settings = run.Settings(["neighbours"], True, None, tmp_path, tmp_path, False)
-    (row,) = run.run(settings).rows.values()
-    assert (row.key.method, row.library, row.status) == ("theirs", "open3d", "failed")
-    assert row.why == "its process ended with code -11"
