@@ -82,8 +82,9 @@ WORKLOADS = {
     "sensor_sequences": Workload(
         "Sequences of other people's sensors",
         "Scans of a lidar that moves into one frame, no guess. `placed`: scans of the "
-        "largest group; `wrong`: those beyond 5 degrees and 0.6 m; `e_R`, `e_t`: mean "
-        "errors in the frame of its first scan; all of the worst of three keys.",
+        "largest group; `wrong`: those beyond 5 degrees and 0.6 m. Errors are those of "
+        "the MCC paper, with the group's first scan as the common frame; all of the "
+        "worst of three keys.",
         cores="all",
         quick=False,
     ),

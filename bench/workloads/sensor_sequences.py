@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from bench.case import Case, Judged, Method, Options
@@ -12,6 +13,7 @@ from bench.records import Metric, error
 from bench.workloads.multiview import PEER, peer_method
 from bench.workloads.sensor_data import Sequence, pose_errors, sequences
 from jaxreg import reconstruct
+from jaxreg.metrics import rotation_error, translation_error
 
 
 # A scan so far from where it belongs, in degrees and metres, is wrong.
@@ -63,11 +65,7 @@ def by_peer(peer: Multiway, scans: list[np.ndarray], seed: int) -> Placed:
 
 
 def judge(data: Sequence, answers: list[Placed]) -> Judged:
-    """Scans of the largest group, and their errors; the worst of the keys.
-
-    Errors are means over those scans in the frame of the first of them, of the turn and
-    of the distance at the scan's centroid.
-    """
+    """Scans of the largest group, and their mean errors; the worst of the keys."""
     placed, wrong, turns, shifts = [], [], [], []
     for component, T in answers:
         some = component[component >= 0]
@@ -76,8 +74,9 @@ def judge(data: Sequence, answers: list[Placed]) -> Judged:
         both = np.array([_error(data, T, ids[0], i) for i in ids[1:]]).reshape(-1, 2)
         placed.append(len(ids))
         wrong.append(np.sum(np.any(both > _WRONG, axis=1)))
-        turns.append(np.radians(both[:, 0].mean()) if len(both) else np.inf)
-        shifts.append(1e3 * both[:, 1].mean() if len(both) else np.inf)
+        found, true = (jnp.asarray(x[ids], jnp.float32) for x in (T, data.T_world_i))
+        turns.append(float(rotation_error(found, true)) if len(both) else np.inf)
+        shifts.append(1e3 * float(translation_error(found, true)))
     return Judged(
         [
             Metric("placed", float(min(placed)), "scans", "up", 0.0),

@@ -96,7 +96,7 @@ def test_scans_of_the_largest_group_are_judged_in_the_frame_of_its_first():
     judged = sensor_sequences.judge(data, [(np.array([1, 0, 0, 0, -1]), found)])
     told = {m.key: m.value for m in judged.metrics}
     assert (told["placed"], told["wrong"]) == (3, 1)
-    assert told["e_t"] == pytest.approx(500)
+    assert told["e_t"] == pytest.approx(1000 / 3)
 
 
 def test_a_table_has_a_line_for_each_pair_and_sums_at_the_end():
