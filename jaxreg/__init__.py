@@ -92,6 +92,7 @@ from jaxreg.matching import PointToPoint as PointToPoint
 from jaxreg.matching import Symmetric as Symmetric
 from jaxreg.multiview import ReconstructionSolution as ReconstructionSolution
 from jaxreg.multiview import RelativeMotions as RelativeMotions
+from jaxreg.multiview import ScanPositions as ScanPositions
 from jaxreg.multiview import reconstruct as reconstruct
 from jaxreg.neighbours import AbstractIndex as AbstractIndex
 from jaxreg.neighbours import BoxTree as BoxTree
@@ -104,6 +105,7 @@ from jaxreg.particle import AbstractEnergy as AbstractEnergy
 from jaxreg.particle import AbstractPrior as AbstractPrior
 from jaxreg.particle import AbstractResampler as AbstractResampler
 from jaxreg.particle import MultiStart as MultiStart
+from jaxreg.particle import PartialPose as PartialPose
 from jaxreg.particle import ParticleFilter as ParticleFilter
 from jaxreg.particle import sandhu2010 as sandhu2010
 from jaxreg.registrar import AbstractRegistrar as AbstractRegistrar

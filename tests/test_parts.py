@@ -90,11 +90,13 @@ def test_counts_are_integers_and_leave_something_to_do(kind, field):
         kind(**{field: 2.5})
 
 
+OF_ANY_SIGN = ("min_log_evidence",)
 NUMBERS = [
     (kind, field.name)
     for kind in METHODS
     for field in dataclasses.fields(kind)
     if float in get_args(get_type_hints(kind)[field.name])
+    and field.name not in OF_ANY_SIGN
 ]
 OF_PARTS = [
     (AbsoluteEnergy, "epsilon"),
@@ -119,6 +121,15 @@ def test_numbers_that_make_no_sense_are_refused(kind, field):
             kind(**{field: value})
     with pytest.raises(TypeError, match=f"{name}.*'1'"):
         kind(**{field: "1"})
+
+
+@pytest.mark.parametrize("kind", [jr.ParticleFilter, jr.MultiStart])
+def test_a_logarithm_may_have_any_sign(kind):
+    assert kind(min_log_evidence=-1.0).min_log_evidence == -1
+    with pytest.raises(ValueError, match="min_log_evidence: wanted a number, found"):
+        kind(min_log_evidence=float("nan"))
+    with pytest.raises(TypeError, match="min_log_evidence: wanted a number, found '1'"):
+        kind(min_log_evidence="1")
 
 
 @pytest.mark.parametrize(

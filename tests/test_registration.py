@@ -71,12 +71,16 @@ def test_a_tenth_of_an_object_is_found_in_the_whole():
         assert shift < 0.03  # the object is 0.2 wide, the motion some metres
 
 
-def test_a_patch_of_a_smooth_surface_is_ambiguous():
-    target = blob(M, 3, seed=2)
-    for seed in (0, 3):
+def test_a_patch_of_a_smooth_surface_is_ambiguous_or_right():
+    target, ambiguous = blob(M, 3, seed=2), 0
+    for seed in range(4):
         sol = jr.register(_tenth(blob(10 * N, 3, 7), seed), target, key=KEY)
-        assert int(sol.status) == Status.AMBIGUOUS
-        assert np.sum(np.asarray(sol.modes.weight) > 0.1) > 1
+        if int(sol.status) == Status.CONVERGED:
+            assert pose_error(sol.T_target_source, np.eye(4))[0] < 0.01
+        else:
+            assert int(sol.status) == Status.AMBIGUOUS
+            ambiguous += 1
+    assert ambiguous >= 2
 
 
 PLANE = jr.ICP()

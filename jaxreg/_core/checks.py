@@ -184,6 +184,11 @@ def check_not_negative(method: object, *names: str) -> None:
     _check_numbers(method, names, lambda x: x >= 0, "a number of at least 0")
 
 
+def check_numbers(method: object, *names: str) -> None:
+    """Requires numbers, infinite ones too; those that are traced are not looked at."""
+    _check_numbers(method, names, lambda x: ~np.isnan(x), "a number")
+
+
 def check_shares(method: object, *names: str) -> None:
     """Requires numbers above zero, one at most; traced ones are not looked at."""
     _check_numbers(

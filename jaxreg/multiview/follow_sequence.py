@@ -15,7 +15,7 @@ from jaxreg._core.arrays import cast_floats
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import NO_EVIDENCE, PlaneToPlane, Problem
-from jaxreg.multiview.method import follower
+from jaxreg.multiview.method import follower, log_prior
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.registrar import AbstractRegistrar
@@ -49,13 +49,14 @@ def descended(
         widths = jnp.geomspace(widest, 0.5 * spacing, _STEPS).astype(dtype)
         T = lie.orthonormalise(coarse.repeat(problem, T, widths))
         evidence = scans.witness(i, j).of_pose(T)
+        told = evidence.log_evidence + log_prior(scans.method_of(method, i, j), T)
         T = fine.repeat(problem, T, jnp.full(_POLISH, 0.5 * spacing, dtype))
         sound = scans.usable[i] & scans.usable[j] & jnp.all(jnp.isfinite(T))
         return RelativeMotions(
             row[0],
             jnp.where(sound, lie.orthonormalise(T), jnp.eye(len(T), dtype=dtype))[None],
             jnp.where(sound, evidence.overlap, 0)[None],
-            jnp.where(sound, evidence.log_evidence, NO_EVIDENCE)[None],
+            jnp.where(sound, told, NO_EVIDENCE)[None],
             evidence.inlier_rmse[None],
         )
 

@@ -1,9 +1,10 @@
 """What the pipeline asks of a method of registration, beyond its contract."""
 
+import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxreg._core.typing import Key, Scalar
-from jaxreg.cloud import Frames, PointCloud
+from jaxreg._core.typing import Key, Motion, Scalar
+from jaxreg.cloud import PointCloud
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import LIKELY, PointToPlane
 from jaxreg.neighbours import AbstractIndex, VoxelTable
@@ -46,13 +47,11 @@ def index_of(method: AbstractRegistrar, cloud: PointCloud) -> AbstractIndex:
 
 def solve(
     method: AbstractRegistrar,
-    frames: Frames,
     clouds: tuple[PointCloud, PointCloud],
     indexes: tuple[AbstractIndex, AbstractIndex],
     key: Key,
 ) -> RegistrationSolution:
-    """Registers the first of two prepared scans to the second."""
-    method = method.in_frames(frames)
+    """Registers the first of two prepared scans to the second, in their frames."""
     if isinstance(method, AbstractIndexedRegistrar):
         return method.solve_indexed(*clouds, *indexes, None, key)
     return method.solve(*clouds, None, key)
@@ -65,3 +64,10 @@ def follower(method: AbstractRegistrar) -> tuple[LocalOptimiser, Scalar | float]
         return LocalOptimiser(*parts), method.width_start
     parts = PointToPlane(0.2), GemanMcClure(), GaussNewton()
     return LocalOptimiser(*parts), _WIDEST
+
+
+def log_prior(method: AbstractRegistrar, T_target_source: Motion) -> Scalar:
+    """What is known beforehand against a pose, in the frames of the method."""
+    if isinstance(method, AbstractSearch) and method.prior is not None:
+        return method.prior.log_density(T_target_source)
+    return jnp.zeros((), T_target_source.dtype)

@@ -12,6 +12,7 @@ from jaxreg.cloud import Frames, PointCloud, centroid, median_spacing, rms_radiu
 from jaxreg.geometry import lie
 from jaxreg.matching import Witness
 from jaxreg.multiview.method import index_of
+from jaxreg.multiview.positions import ScanPositions
 from jaxreg.neighbours import AbstractIndex, index_within
 from jaxreg.registrar import AbstractRegistrar
 
@@ -35,6 +36,7 @@ class PreparedScans(eqx.Module):
             valid ones; UNIT_DIFFERS, its radius is not of the others' order; CONVERGED,
             nothing.
         num_dropped: `(v,)` rows of the input that were not finite.
+        positions: about where their scanners stood, None if unknown.
     """
 
     clouds: PointCloud
@@ -45,6 +47,7 @@ class PreparedScans(eqx.Module):
     spacing: Float[Array, " v"]
     fault: Int[Array, " v"]
     num_dropped: Int[Array, " v"]
+    positions: ScanPositions | None = None
 
     @property
     def num_scans(self) -> int:
@@ -74,6 +77,14 @@ class PreparedScans(eqx.Module):
         clouds = self.cloud(j), self.cloud(i)
         near = (jax.tree.map(lambda x, k=k: x[k], self.exact) for k in (j, i))
         return Witness.of(*clouds, *near)
+
+    def method_of(
+        self, method: AbstractRegistrar, i: Int[Array, ""], j: Int[Array, ""]
+    ) -> AbstractRegistrar:
+        """The method for scan j as the source and scan i as the target."""
+        if self.positions is not None:
+            method = self.positions.of_pair(method, i, j)
+        return method.in_frames(self.frames(i, j))
 
     def frames(self, i: Int[Array, ""], j: Int[Array, ""]) -> Frames:
         """Those of scan j as the source and scan i as the target."""
@@ -136,6 +147,7 @@ def prepare_scans(
     points: Float[Array, "v n d"],
     mask: Bool[Array, "v n"],
     viewpoints: Float[Array, "v d"] | None = None,
+    positions: ScanPositions | None = None,
 ) -> PreparedScans:
     """Prepares all scans, one after another; NaN stands for an unknown viewpoint."""
     points, mask, dropped = clean(points, mask)
@@ -147,7 +159,9 @@ def prepare_scans(
         eyes = (viewpoints - mean) / radius
         clouds = lax.map(lambda scan: scan[0].seen_from(scan[1]), (clouds, eyes))
     fault = _fault(clouds, jax.vmap(rms_radius)(points, mask) / radius, spacing)
-    return PreparedScans(clouds, tables, exact, mean, radius, spacing, fault, dropped)
+    return PreparedScans(
+        clouds, tables, exact, mean, radius, spacing, fault, dropped, positions
+    )
 
 
 def _fault(

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxreg._core.arrays import cast_floats
 from jaxreg._core.checks import check_instance, check_key, is_concrete
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging import AbstractAverager
@@ -18,6 +19,7 @@ from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
 from jaxreg.multiview.choose_pairs import Order, all_pairs, first_pairs
 from jaxreg.multiview.conclude import finish
 from jaxreg.multiview.hold_poses import Held
+from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.prepare import PreparedScans, prepare_scans
 from jaxreg.multiview.register_pairs import OnPairs, Rounds
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
@@ -34,6 +36,7 @@ def reconstruct(
     averaging: AbstractAverager | None = None,
     mask: ArrayLike | None = None,
     viewpoints: ArrayLike | None = None,
+    positions: ScanPositions | None = None,
     order: Order | str = "any",
     previous: object = None,
     hold_previous: bool = False,
@@ -60,6 +63,7 @@ def reconstruct(
             between its viewpoint and its points, and poses that put points of others
             there count as contradicted. Only for scans from one place each, of what
             does not move.
+        positions: about where the scanners stood, of satellite fixes for instance.
         order: "sequential" if each scan overlaps the next: only neighbours are
             registered to begin with, of any number of scans, where the scanner moved on
             as before without a search; not under `jit`.
@@ -102,6 +106,10 @@ def reconstruct(
             "hold_previous: wanted a ReconstructionSolution as previous, found "
             f"{type(previous).__name__}."
         )
+    check_instance(positions, "positions", ScanPositions | None)
+    if positions is not None:
+        positions.check_fits(points, method)
+        positions = cast_floats(positions, points.dtype)
     key = check_key(key)
     order = _checked(order)
     if not (is_concrete(points) and is_concrete(key)):
@@ -109,14 +117,15 @@ def reconstruct(
             raise ValueError(
                 "order, previous, on_pairs: pairs are chosen outside of jit only."
             )
-        prepared = prepare_scans(method, points, row_mask, eyes)
+        prepared = prepare_scans(method, points, row_mask, eyes, positions)
         pairs = jnp.asarray(all_pairs(points.shape[0]))
         motions = relative_motions(method, prepared, pairs, key)
         return finish(method, averaging, prepared, motions)
 
     report = progress if progress is not None else _silent
     report("preparing scans", 0, 1)
-    prepared = jax.block_until_ready(prepare_scans(method, points, row_mask, eyes))
+    prepared = prepare_scans(method, points, row_mask, eyes, positions)
+    prepared = jax.block_until_ready(prepared)
     report("preparing scans", 1, 1)
     known, first = _known(previous, prepared, order)
     rounds = Rounds(method, averaging, prepared, key, known, on_pairs, report)

@@ -135,8 +135,7 @@ def relative_motions(
     def one(pair: Array) -> RelativeMotions:
         i, j = pair
         solution = solve(
-            method,
-            scans.frames(i, j),
+            scans.method_of(method, i, j),
             (scans.cloud(j), scans.cloud(i)),
             (scans.table(j), scans.table(i)),
             jax.random.fold_in(jax.random.fold_in(key, i), j),

@@ -18,6 +18,7 @@ from jaxreg.particle.presets import sandhu2010 as sandhu2010
 from jaxreg.particle.priors import AbstractPrior as AbstractPrior
 from jaxreg.particle.priors import GaussianPrior as GaussianPrior
 from jaxreg.particle.priors import GivenParticles as GivenParticles
+from jaxreg.particle.priors import PartialPose as PartialPose
 from jaxreg.particle.priors import UniformPrior as UniformPrior
 from jaxreg.particle.resamplers import AbstractResampler as AbstractResampler
 from jaxreg.particle.resamplers import Multinomial as Multinomial

@@ -32,7 +32,12 @@ from jaxreg.neighbours import (
 from jaxreg.particle.conclude import APART, conclude
 from jaxreg.particle.energies import AbstractEnergy
 from jaxreg.particle.pair import Pair
-from jaxreg.particle.priors import AbstractPrior, GaussianPrior, UniformPrior
+from jaxreg.particle.priors import (
+    AbstractPrior,
+    GaussianPrior,
+    PartialPose,
+    UniformPrior,
+)
 from jaxreg.particle.proposals import propose_modes
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import (
@@ -196,6 +201,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
             found.num_steps,
             found.finished,
             self._proposals(pair, found.sure, init),
+            None if self.prior is None else self.prior.log_density,
             kernel=self.kernel,
             num_modes=self.num_modes,
             refine_steps=self.refine_steps,
@@ -207,7 +213,9 @@ class AbstractSearch(AbstractIndexedRegistrar):
         self, pair: Pair, sure: Bool[Array, ""], init: Motion | None
     ) -> tuple[Float[Array, "r 4 4"], Bool[Array, " r"]] | None:
         """Poses of local features and which are in use, where any may be the answer."""
-        anywhere = self.prior is None and init is None
+        anywhere = init is None and (
+            self.prior is None or isinstance(self.prior, PartialPose)
+        )
         judged = self.refine_steps > 0 and pair.source.points.shape[1] == 3
         if not (self.num_proposals and anywhere and judged):
             return None

@@ -1,5 +1,6 @@
 """From many measured poses to an answer: modes, refinement, evidence, status."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -52,6 +53,7 @@ def conclude(
     num_steps: Int[Array, ""],
     finished: Bool[Array, ""],
     proposals: tuple[Float[Array, "r D D"], Bool[Array, " r"]] | None = None,
+    log_prior: Callable[[Motion], Scalar] | None = None,
     *,
     kernel: AbstractKernel,
     num_modes: int,
@@ -67,6 +69,7 @@ def conclude(
         finished: whether they had come to rest.
         proposals: more poses to refine and judge, and which are in use; they count
             where surfaces hold them and a seventh of the source is shared.
+        log_prior: of a pose, added to its log evidence.
         kernel: of the refinement.
         num_modes: distinct poses of the particles to refine and judge; of these and the
             proposals the solution has as many.
@@ -88,6 +91,9 @@ def conclude(
         pair.problem, kernel, T_modes, mass > 0, spacing, refine_steps
     )
     evidence = witness.of_poses(T_modes, sound)
+    if log_prior is not None:
+        told = evidence.log_evidence + jax.vmap(log_prior)(T_modes)
+        evidence = dataclasses.replace(evidence, log_evidence=told)
     sound = sound & ((jnp.arange(len(sound)) < num_modes) | _convincing(evidence))
     by_evidence = jnp.argsort(-jnp.where(sound, evidence.log_evidence, NO_EVIDENCE))
     order = by_evidence[:num_modes] if refine_steps else jnp.arange(num_modes)

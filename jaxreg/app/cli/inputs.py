@@ -14,6 +14,7 @@ from jaxreg.io.points.read import (
     read_named,
     unique_names,
 )
+from jaxreg.io.rows import numbers, read_lines
 
 
 # Scans whose extents differ by such a factor are taken to be in different units.
@@ -141,3 +142,33 @@ def _require_points(place: str, array: np.ndarray) -> None:
             f"{place}: holds {distinct} distinct finite points of {len(array)} rows, "
             f"at least {wanted} are needed.\nExport the scan again, or leave it out."
         )
+
+
+def check_point(found: tuple[float, ...] | None, dim: int, option: str) -> None:
+    """Requires as many finite numbers as the scans have dimensions, or none."""
+    if found is None:
+        return
+    if len(found) != dim or not np.all(np.isfinite(found)):
+        numbers = " ".join(map(str, found))
+        raise InputError(f"{option}: wanted {dim} finite numbers, found {numbers}.")
+
+
+def read_positions(path: Path, scans: Scans) -> np.ndarray:
+    """Lines `NAME X Y [Z]`, one for each scan; `(v, d)` float64 in their order.
+
+    Raises:
+        InputError: for a file that cannot be read, a line that makes no sense, and a
+            scan that has none.
+    """
+    dim = scans.points[0].shape[1]
+    found: dict[str, np.ndarray] = {}
+    for number, (name, *words) in read_lines(path):
+        found[name] = numbers(path, (number, words), dim, f"the position of {name}")
+    missing = [name for name in scans.names if name not in found]
+    if missing:
+        raise InputError(
+            f"{path}: has no position of {', '.join(missing[:3])}"
+            f"{', ...' if len(missing) > 3 else ''}.\n"
+            f"Give a line NAME {' '.join('XYZ'[:dim])} for each scan."
+        )
+    return np.stack([found[name] for name in scans.names])

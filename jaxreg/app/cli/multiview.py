@@ -14,7 +14,7 @@ import jaxreg
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Progress
 from jaxreg.app.cli import outputs
-from jaxreg.app.cli.inputs import Scans, load_scans
+from jaxreg.app.cli.inputs import Scans, check_point, load_scans, read_positions
 from jaxreg.app.cli.runtime import SearchOptions, Session
 from jaxreg.app.pair_log import PairLog, Pairs
 from jaxreg.app.plot.results import result_of
@@ -47,6 +47,11 @@ class Multiview(SearchOptions):
         tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
     ] = None
     """Where the scanner stood in the frame of every scan, in its unit: often 0 0 0."""
+    positions: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
+    ] = None
+    """Lines NAME X Y [Z]: about where each scan's scanner stood; see --deviation."""
     resume: bool = False
     """Go on with the pairs that an interrupted run left in the output folder."""
 
@@ -58,7 +63,9 @@ class Multiview(SearchOptions):
                     "No scans given.\nUsage: jaxreg multiview SCAN SCAN ..."
                 )
             scans = load_scans(self.scans)
+            self.check_known(scans.points[0].shape[1])
             _check_viewpoint(self.viewpoint, scans)
+            located = self._located(scans)
             truth = None if self.truth is None else _read_truth(self.truth, scans)
         for note in scans.notes:
             session.console.print(note)
@@ -66,7 +73,14 @@ class Multiview(SearchOptions):
         try:
             with session.progress() as progress, session.timed("run", computes=True):
                 result = reconstruct_scans(
-                    scans, key, method, progress, self.order, log, self.viewpoint
+                    scans,
+                    key,
+                    method,
+                    progress,
+                    self.order,
+                    log,
+                    self.viewpoint,
+                    located,
                 )
         except KeyboardInterrupt as err:
             if not len(log):
@@ -81,6 +95,17 @@ class Multiview(SearchOptions):
         log.remove()
         return 0
 
+    def _located(self, scans: Scans) -> jaxreg.ScanPositions | None:
+        """About where the scanners stood, for scans moved to their middles."""
+        if self.positions is None:
+            return None
+        antenna = -scans.centred()[1]
+        if self.viewpoint is not None:
+            antenna = antenna + self.viewpoint
+        return jaxreg.ScanPositions(
+            read_positions(self.positions, scans), self.deviation, antenna
+        )
+
     def _log(self, session: Session, scans: Scans) -> PairLog:
         digest = hashlib.sha256(repr(scans.names).encode())
         for points in scans.points:
@@ -89,6 +114,10 @@ class Multiview(SearchOptions):
             "scans": digest.hexdigest(),
             "seed": self.seed,
             "viewpoint": self.viewpoint,
+            "upright": self.upright,
+            "positions": None
+            if self.positions is None
+            else [self.deviation, read_positions(self.positions, scans).tolist()],
             "budget": self.budget,
             "precision": self.precision,
             "version": version("jaxreg"),
@@ -120,6 +149,7 @@ def reconstruct_scans(
     order: Order = "any",
     log: PairLog | None = None,
     viewpoint: tuple[float, ...] | None = None,
+    positions: jaxreg.ScanPositions | None = None,
 ) -> Result:
     """Reconstructs centred scans and moves the answer to the frames of the files.
 
@@ -134,6 +164,7 @@ def reconstruct_scans(
         method=method,
         order=order,
         viewpoints=eyes,
+        positions=positions,
         previous=None if kept is None else jaxreg.RelativeMotions(*map(_array, kept)),
         progress=progress,
         on_pairs=None if log is None else lambda m: log.add(_pairs(m)),
@@ -151,11 +182,9 @@ def reconstruct_scans(
 
 def _check_viewpoint(viewpoint: tuple[float, ...] | None, scans: Scans) -> None:
     d = scans.points[0].shape[1]
+    check_point(viewpoint, d, "--viewpoint")
     if viewpoint is None:
         return
-    if len(viewpoint) != d or not np.all(np.isfinite(viewpoint)):
-        found = " ".join(map(str, viewpoint))
-        raise InputError(f"--viewpoint: wanted {d} finite numbers, found {found}.")
     for points, place in zip(scans.points, scans.places, strict=True):
         if np.any(np.all(points == np.asarray(viewpoint), axis=1)):
             raise InputError(

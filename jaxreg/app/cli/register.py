@@ -12,7 +12,7 @@ import tyro
 import jaxreg
 from jaxreg._core.status import Status
 from jaxreg.app.cli import outputs
-from jaxreg.app.cli.inputs import Scans, load_scans
+from jaxreg.app.cli.inputs import Scans, check_point, load_scans
 from jaxreg.app.cli.runtime import SearchOptions, Session
 from jaxreg.app.plot.results import result_of
 from jaxreg.app.result import Result
@@ -28,6 +28,12 @@ class Register(SearchOptions):
     target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
     """The scan that stays; its frame is that of the result."""
 
+    position: Annotated[
+        tuple[float, ...] | None,
+        tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
+    ] = None
+    """About where the source's origin is in the target's frame; see --deviation."""
+
     def run(self, session: Session) -> int:
         """Runs the command; returns the exit code."""
         with session.timed("read"):
@@ -39,7 +45,10 @@ class Register(SearchOptions):
             )
         for note in scans.notes:
             session.console.print(note)
-        key, method = self.key(), self.method()
+        dim = scans.points[0].shape[1]
+        self.check_known(dim)
+        check_point(self.position, dim, "--position")
+        key, method = self.key(), self._located(self.method(), scans)
         with session.progress() as progress, session.timed("run", computes=True):
             progress("registering", 0, 1)
             result, modes, covariances = _register(scans, key, method)
@@ -54,6 +63,22 @@ class Register(SearchOptions):
         )
         _show(session, result)
         return 0
+
+    def _located(
+        self, method: jaxreg.ParticleFilter, scans: Scans
+    ) -> jaxreg.ParticleFilter:
+        """Knowing `position`, between scans that are moved to their middles."""
+        if self.position is None:
+            return method
+        target, source = (-middle for middle in scans.centred()[1])
+        prior = jaxreg.PartialPose(
+            up=(0, 0, 1) if self.upright else None,
+            position=self.position,
+            deviation=self.deviation,
+            source_scanner=source,
+            target_scanner=target,
+        )
+        return dataclasses.replace(method, prior=prior)
 
 
 def _register(

@@ -1,6 +1,7 @@
 """What every command shares: options, the screen, the clock, the compilation cache."""
 
 import contextlib
+import math
 import os
 import sys
 import time
@@ -74,6 +75,10 @@ class SearchOptions(Options):
 
     budget: int = _FILTER.num_prior
     """Poses drawn at most for a pair of scans; more find harder pairs and take time."""
+    upright: bool = False
+    """The scanners were level: the last axis of every scan points up."""
+    deviation: float = 1.0
+    """Of positions that are given, in the unit of the scans."""
 
     def method(self) -> jaxreg.ParticleFilter:
         """The search of that size."""
@@ -83,7 +88,19 @@ class SearchOptions(Options):
                 f"--budget {self.budget}: wanted a number from {least} to 2^20."
             )
         carried = min(_FILTER.num_particles, self.budget)
-        return jaxreg.ParticleFilter(num_prior=self.budget, num_particles=carried)
+        prior = jaxreg.PartialPose(up=(0, 0, 1)) if self.upright else None
+        return jaxreg.ParticleFilter(
+            num_prior=self.budget, num_particles=carried, prior=prior
+        )
+
+    def check_known(self, dim: int) -> None:
+        """Requires 3D scans of what is upright, and a deviation above zero."""
+        if self.upright and dim != 3:
+            raise InputError("--upright: of 3D scans only, these are 2D.")
+        if not 0 < self.deviation < math.inf:
+            raise InputError(
+                f"--deviation {self.deviation}: wanted a number above zero."
+            )
 
 
 class Session:

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from jaxtyping import Array, Float
 
 from jaxreg._core.brief import BriefModule
-from jaxreg._core.typing import Key, Motion
+from jaxreg._core.typing import Key, Motion, Scalar
 from jaxreg.registrar import Frames
 
 
@@ -34,4 +34,12 @@ class AbstractPrior(BriefModule):
         """The prior with its poses in the frames of the search.
 
         Users give them in the frames of the input. The prior itself if it has none.
+        """
+
+    @abc.abstractmethod
+    def log_density(self, T_target_source: Motion) -> Scalar:
+        """What it has against a pose in the frames of the search: zero at most.
+
+        It is added to the pose's `log_evidence`. Zero of priors that only say where to
+        begin.
         """

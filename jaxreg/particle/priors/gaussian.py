@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_not_negative, is_concrete
-from jaxreg._core.typing import Key, Motion
+from jaxreg._core.typing import Key, Motion, Scalar
 from jaxreg.geometry import lie
 from jaxreg.local import turn_and_shift
 from jaxreg.particle.priors.base import AbstractPrior
@@ -56,3 +56,7 @@ class GaussianPrior(AbstractPrior):
         spread = jnp.where(translates, self.translation_spread, self.rotation_spread)
         tangent = spread.astype(dtype) * jax.random.normal(key, (num, k), dtype)
         return jax.vmap(turn_and_shift, (None, 0))(init, tangent.at[0].set(0))
+
+    def log_density(self, T_target_source: Motion) -> Scalar:
+        """Zero: it only says where to begin."""
+        return jnp.zeros((), T_target_source.dtype)

@@ -4,10 +4,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import as_float_array
-from jaxreg._core.typing import Key, Motion
+from jaxreg._core.typing import Key, Motion, Scalar
 from jaxreg.particle.priors.base import AbstractPrior
 from jaxreg.registrar import Frames
 
@@ -58,6 +59,10 @@ class GivenParticles(AbstractPrior):
         """With each pose between the centroids."""
         self._check_dimension(frames.d)
         return GivenParticles(jax.vmap(frames.enter)(self.T_target_source))
+
+    def log_density(self, T_target_source: Motion) -> Scalar:
+        """Zero: it only says where to begin."""
+        return jnp.zeros((), T_target_source.dtype)
 
     def _check_dimension(self, d: int) -> None:
         if self.T_target_source.shape[-1] != d + 1:

@@ -3,11 +3,12 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_not_negative
-from jaxreg._core.typing import Key, Motion
+from jaxreg._core.typing import Key, Motion, Scalar
 from jaxreg.geometry import lie
 from jaxreg.particle.priors.base import AbstractPrior
 from jaxreg.registrar import Frames
@@ -42,3 +43,7 @@ class UniformPrior(AbstractPrior):
         R = lie.random_rotations(key_R, num, d, dtype)
         t = self.translation_spread * jax.random.normal(key_t, (num, d), dtype)
         return lie.compose(R, t if init is None else t + lie.translation(init))
+
+    def log_density(self, T_target_source: Motion) -> Scalar:
+        """Zero: it only says where to begin."""
+        return jnp.zeros((), T_target_source.dtype)

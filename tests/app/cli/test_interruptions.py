@@ -46,8 +46,10 @@ def test_interruption_is_said_in_one_line(
 
 def test_an_interruption_that_python_dropped_is_heard_again():
     code = """
-import gc, sys, time
+import gc, signal, sys, time
 from jaxreg.app.cli import main
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
 
 def drop(*_):
     gc.callbacks.clear()
