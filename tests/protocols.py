@@ -138,6 +138,7 @@ ENERGIES = [
 PRIORS = [
     (particle.GaussianPrior(), 8),
     (particle.GivenParticles(problems.poses(3)), NUM_POSES),
+    (particle.PartialPose(up=(0, 0, 1), position=(0.5, 0.1, 0.2)), 8),
     (particle.UniformPrior(), 8),
 ]
 #: Public functions: the three verbs, and those that need no method.

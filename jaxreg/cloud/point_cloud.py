@@ -25,6 +25,8 @@ class PointCloud(BriefModule):
             four on a surface, where it is known (`with_spacing`).
         fine: the same surface with more points, for the last digits of a pose; None if
             there are no more.
+        judged: the same surface with as many points as poses are judged by; None if
+            these are as many.
     """
 
     points: Float[Array, "n d"]
@@ -33,17 +35,17 @@ class PointCloud(BriefModule):
     seen: RangeImage | None = None
     spacing: Float[Array, " n"] | None = None
     fine: "PointCloud | None" = None
+    judged: "PointCloud | None" = None
 
     def padded(self, num: int) -> "PointCloud":
         """With masked rows behind it, `num` in all."""
         rows = (0, num - self.mask.shape[0])
-        return PointCloud(
-            jnp.pad(self.points, (rows, (0, 0))),
-            jnp.pad(self.normals, (rows, (0, 0))),
-            jnp.pad(self.mask, rows),
-            self.seen,
-            None if self.spacing is None else jnp.pad(self.spacing, rows),
-            self.fine,
+        return replace(
+            self,
+            points=jnp.pad(self.points, (rows, (0, 0))),
+            normals=jnp.pad(self.normals, (rows, (0, 0))),
+            mask=jnp.pad(self.mask, rows),
+            spacing=None if self.spacing is None else jnp.pad(self.spacing, rows),
         )
 
     def first(self, num: int) -> "PointCloud":
@@ -52,19 +54,23 @@ class PointCloud(BriefModule):
 
     def of_rows(self, rows: Int[Array, " r"] | slice) -> "PointCloud":
         """Some of the rows, which keep the spacing that they have among all."""
-        return PointCloud(
-            self.points[rows],
-            self.normals[rows],
-            self.mask[rows],
-            self.seen,
-            None if self.spacing is None else self.spacing[rows],
-            self.fine,
+        return replace(
+            self,
+            points=self.points[rows],
+            normals=self.normals[rows],
+            mask=self.mask[rows],
+            spacing=None if self.spacing is None else self.spacing[rows],
         )
 
     @property
     def finest(self) -> "PointCloud":
         """With the most points there are."""
         return self if self.fine is None else self.fine
+
+    @property
+    def as_judged(self) -> "PointCloud":
+        """With as many points as poses are judged by."""
+        return self if self.judged is None else self.judged
 
     def spread(self, num: int) -> "PointCloud":
         """At most so many valid rows, spread over the array; no spacing is known."""
@@ -77,7 +83,8 @@ class PointCloud(BriefModule):
     def seen_from(self, viewpoint: Float[Array, " d"]) -> "PointCloud":
         """With what was seen of it from there; of NaN nothing is known."""
         seen = RangeImage.of(self.points, self.mask, viewpoint)
-        return replace(self, seen=seen)
+        judged = None if self.judged is None else self.judged.seen_from(viewpoint)
+        return replace(self, seen=seen, judged=judged)
 
     def with_spacing(self) -> "PointCloud":
         """With the spacing around each point, by comparing all pairs if not known."""

@@ -74,7 +74,7 @@ class PreparedScans(eqx.Module):
 
     def witness(self, i: Int[Array, ""], j: Int[Array, ""]) -> Witness:
         """Who tells how likely motions of scan j into scan i are."""
-        clouds = self.cloud(j), self.cloud(i)
+        clouds = self.cloud(j).as_judged, self.cloud(i).as_judged
         near = (jax.tree.map(lambda x, k=k: x[k], self.exact) for k in (j, i))
         return Witness.of(*clouds, *near)
 
@@ -137,7 +137,10 @@ def prepare_scan(
     cloud = method.prepare((points - mean) / radius, mask).with_spacing()
     table = index_of(method, cloud)
     spacing = median_spacing(cloud.points, cloud.mask)
-    exact = index_within(cloud.points, cloud.mask, spacing)
+    judged, within = cloud.as_judged, spacing
+    if cloud.judged is not None:
+        within = median_spacing(judged.points, judged.mask)
+    exact = index_within(judged.points, judged.mask, within)
     return cloud, table, exact, mean, spacing
 
 

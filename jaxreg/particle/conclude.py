@@ -40,6 +40,8 @@ RIVAL_MARGIN = 0.5
 _LEAST_SHARED = 1 / 7
 # Modes of so much less evidence than the first are not worth the last steps.
 _HOPELESS = 6.0
+# What is known beforehand may outweigh all evidence: no pose has more.
+_MOST_EVIDENCE = 10.0
 # Steps of the most accurate residual, where it is close already.
 _POLISH = 8
 
@@ -79,9 +81,12 @@ def conclude(
     """
     dtype = particles.energy.dtype
     limit = jnp.asarray(APART, dtype)
-    rows, mass = distinct_modes(particles, num_modes, angle=limit, distance=limit)
+    last = None
+    if log_prior is not None:
+        last = jax.vmap(log_prior)(particles.T_target_source) < -_MOST_EVIDENCE
+    rows, mass = distinct_modes(particles, num_modes, last, angle=limit, distance=limit)
     spacing, exact = pair.spacing, pair.exact
-    witness = exact.witness
+    witness = pair.witness(exact)
     T_modes = particles.T_target_source[rows]
     if proposals is not None:
         T_more, in_use = proposals

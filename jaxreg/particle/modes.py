@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
@@ -10,20 +10,28 @@ from jaxreg.particle.state import Particles
 
 
 def distinct_modes(
-    particles: Particles, num_modes: int, *, angle: Scalar, distance: Scalar
+    particles: Particles,
+    num_modes: int,
+    last: Bool[Array, " p"] | None = None,
+    *,
+    angle: Scalar,
+    distance: Scalar,
 ) -> tuple[Int[Array, " q"], Float[Array, " q"]]:
     """Rows of the best particles that differ from one another, and their weights.
 
     Greedy: the particle of least energy is a mode and takes the weight of all
     particles within `angle` (radians) and `distance` of it; then the next among the
-    rest. Surplus modes have weight zero and repeat the first row.
+    rest. Surplus modes have weight zero and repeat the first row. Those of `last` come
+    after all others.
     """
     T = particles.T_target_source
     R, t = lie.rotation(T), lie.translation(T)
     weight = jnp.exp(particles.log_weight)
 
     def pick(free: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-        best = jnp.argmin(jnp.where(free, particles.energy, jnp.inf))
+        first = free if last is None else free & ~last
+        first = jnp.where(jnp.any(first), first, free)
+        best = jnp.argmin(jnp.where(first, particles.energy, jnp.inf))
         turn = lie.rotation_angle(jnp.einsum("pij,kj->pik", R, R[best]))
         shift = jnp.sqrt(jnp.sum((t - t[best]) ** 2, axis=-1))
         same = free & (turn < angle) & (shift < distance)

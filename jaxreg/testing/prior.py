@@ -21,7 +21,8 @@ def check_prior(prior: AbstractPrior, *, d: int = 3, num: int = 64) -> None:
 
     Promised are: `num` rigid poses in the dtype that is asked for; the same by the same
     key, compiled or not; that a prior in the frames of a search is a prior of such
-    poses too, and the same where those frames are those of the input.
+    poses too, and the same where those frames are those of the input; that its
+    `log_density` of a pose is one number, zero at most, and the same in any frames.
 
     Args:
         prior: the prior.
@@ -55,6 +56,20 @@ def check_prior(prior: AbstractPrior, *, d: int = 3, num: int = 64) -> None:
                 lambda k, T=single: prior.draw(k, num, d, T, np.dtype(np.float32)), key
             )
             promise_dtypes(out, np.float32, name)
+            for T in found[:4]:
+                _promise_density(name, prior, apart, T)
+
+
+def _promise_density(
+    name: str, prior: AbstractPrior, apart: Frames, T: jax.Array
+) -> None:
+    zero, one = jnp.zeros(apart.d), jnp.ones(())
+    told = prior.in_frames(Frames(zero, zero, one)).log_density(T)
+    promise(told.shape == (), f"{name}: log_density: found shape {told.shape}.")
+    promise_dtypes(told, float, name)
+    promise(-np.inf < float(told) <= 0, f"{name}: log_density speaks for a pose.")
+    other = prior.in_frames(apart).log_density(apart.enter(T))
+    promise_equal(other, told, f"{name}: frames change its log_density")
 
 
 def _promise_poses(name: str, which: str, T: jax.Array, num: int, d: int) -> None:

@@ -1,5 +1,7 @@
 """`reconstruct` on scans of a generated sculpture."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,13 +10,13 @@ import pytest
 from helpers import blob, half_noise, motion, move, pose_error
 
 import jaxreg as jr
-from jaxreg import Status
+from jaxreg import Status, particle
 from jaxreg.datasets import cube_points, sculpture_scans
 from jaxreg.multiview import RelativeMotions
 from jaxreg.multiview.check_scans import padded_scans
 
 
-FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64, max_points=1024)
+FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64)
 
 MOTIONS = RelativeMotions(
     jnp.array([[2, 8]]), jnp.eye(4)[None, None], *(jnp.ones((1, 1)) for _ in range(3))
@@ -216,6 +218,51 @@ def test_cubes_are_ambiguous():
     sol = jr.reconstruct(cubes, key=jax.random.key(0), method=FILTER)
     assert int(sol.status) == Status.AMBIGUOUS
     assert np.sum(np.asarray(sol.scan_status) == Status.AMBIGUOUS) == 7
+
+
+def test_level_cubes_are_told_apart_by_where_their_scanners_stood():
+    # Level ones fit each other in four headings; where each scanner stood tells which.
+    rng = np.random.default_rng(0)
+    cubes, antennas, places, poses = [], [], [], []
+    for seed in range(4):
+        T = np.eye(4)
+        T[:2, :2], T[:3, 3] = motion(seed, 2)[:2, :2], rng.normal(size=3)
+        place = rng.normal(scale=0.5, size=3)
+        points = cube_points(2000, seed, side=0.2).astype(np.float32)
+        cubes.append(move(np.linalg.inv(T), points).astype(np.float32))
+        antennas.append(move(np.linalg.inv(T), place[None])[0])
+        places.append(place + [4e5, 4.2e6, 100])
+        poses.append(T)
+    sol = jr.reconstruct(
+        cubes,
+        key=jax.random.key(0),
+        method=dataclasses.replace(FILTER, prior=jr.PartialPose(up=(0, 0, 1))),
+        positions=jr.ScanPositions(np.array(places), 0.02, np.array(antennas)),
+    )
+    assert int(sol.status) == Status.CONVERGED
+    assert np.array(_errors(sol, np.array(poses)))[:, 0].max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("positions", "method", "words"),
+    [
+        (np.zeros((7, 3)), FILTER, r"wanted shape \(8, 3\), found \(7, 3\)"),
+        (np.zeros((8, 3)), jr.ICP(), "wanted a search"),
+        (
+            np.zeros((8, 3)),
+            dataclasses.replace(FILTER, prior=particle.UniformPrior()),
+            "found UniformPrior",
+        ),
+    ],
+)
+def test_positions_that_cannot_be_used_are_refused(sculpture, positions, method, words):
+    with pytest.raises(ValueError, match=words):
+        jr.reconstruct(
+            sculpture[0],
+            key=jax.random.key(0),
+            method=method,
+            positions=jr.ScanPositions(positions),
+        )
 
 
 def test_identical_scans_lie_on_each_other(sculpture):

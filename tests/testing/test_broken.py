@@ -318,6 +318,12 @@ class Prior(jr.AbstractPrior):
             return UniformPrior()
         return None if self.twist == "no frames" else self
 
+    def log_density(self, T_target_source):
+        t = T_target_source[:-1, -1]
+        if self.twist == "in favour":
+            return jnp.ones((), t.dtype)
+        return -jnp.sum(t**2) if self.twist == "nearsighted" else 0 * t[0]
+
 
 @pytest.mark.parametrize(
     ("twist", "sentence"),
@@ -327,6 +333,8 @@ class Prior(jr.AbstractPrior):
         ("promotes", "data of float32 give float64"),
         ("forgets", "frames of the input change its poses"),
         ("no frames", "in_frames gives no prior"),
+        ("in favour", "log_density speaks for a pose"),
+        ("nearsighted", "frames change its log_density"),
     ],
 )
 def test_priors(twist, sentence):

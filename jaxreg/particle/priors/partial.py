@@ -131,10 +131,8 @@ class PartialPose(AbstractPrior):
                 place = place + lie.rotation(T) @ self.source_scanner
             if self.target_scanner is not None:
                 place = place - self.target_scanner
-            up = None if self.up is None else _unit(self.up)
-            differs = _difference(place, self.position, up, self.oriented)
-            sq = jnp.sum(differs**2) / self.deviation**2
-            excess = excess + sq - differs.size
+            z = self._deviations(place, self.position)
+            excess = excess + jnp.sum(z**2) - z.size
         return jnp.minimum(-excess / 2, 0)
 
     def _vectors(self) -> list[tuple[str, Array]]:
@@ -156,6 +154,27 @@ class PartialPose(AbstractPrior):
         tilt = tilt - (tilt @ up)[:, None] * up
         return lie.rotation_exp(tilt) @ lie.rotation_exp(angle * up)
 
+    def _deviations(
+        self, place: Float[Array, " d"], known: Float[Array, " d"]
+    ) -> Float[Array, " n"]:
+        """From the known position, of what is known of it, in its deviations."""
+        deviation = self.deviation
+        if self.oriented:
+            return (place - known) / deviation
+        if self.up is None:
+            return jnp.stack([_norm(place) - _norm(known)]) / deviation
+        up = _unit(self.up)
+        heights = place @ up, known @ up
+        flat, flat_known = (
+            _norm(x - height * up)
+            for x, height in zip((place, known), heights, strict=True)
+        )
+        # Far away a scanner that is tilted sees the other at another height.
+        leaning = jnp.sqrt(deviation**2 + (self.tilt * flat_known) ** 2)
+        return jnp.stack(
+            [(flat - flat_known) / deviation, (heights[0] - heights[1]) / leaning]
+        )
+
 
 def _unit(x: Float[Array, " d"]) -> Float[Array, " d"]:
     return x / _norm(x)
@@ -169,22 +188,3 @@ def _angle(R: Float[Array, "3 3"], up: Float[Array, "3"]) -> Scalar:
     """Between a direction and its image."""
     # Half the chord is the sine of half the angle, also of small ones.
     return 2 * jnp.arcsin(jnp.minimum(_norm(R @ up - up) / 2, 1))
-
-
-def _difference(
-    place: Float[Array, " d"],
-    known: Float[Array, " d"],
-    up: Float[Array, "3"] | None,
-    oriented: bool,
-) -> Float[Array, " n"]:
-    """From the known position, in the numbers that are known of it."""
-    if oriented:
-        return place - known
-    if up is None:
-        return jnp.stack([_norm(place) - _norm(known)])
-
-    def flat_and_height(x: Float[Array, "3"]) -> Float[Array, "2"]:
-        height = x @ up
-        return jnp.stack([_norm(x - height * up), height])
-
-    return flat_and_height(place) - flat_and_height(known)

@@ -80,6 +80,29 @@ def test_a_viewpoint_is_moved_with_each_scan(
     assert "--viewpoint: wanted 3 finite numbers" in capsys.readouterr().err
 
 
+def test_positions_are_those_of_the_scans_origins(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    scans = save_scans(folder)
+    given = fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    fixes = np.array([[4e5, 4.2e6, 100], [4e5 + 3, 4.2e6, 100], [4e5, 4.2e6 + 4, 102]])
+    lines = [f"s{k} {x:.2f} {y:.2f} {z:.2f}" for k, (x, y, z) in enumerate(fixes)]
+    Path("gnss.txt").write_text("# east north up\n" + "\n".join(lines[::-1]) + "\n")
+    run = ["multiview", *scans, "--positions", "gnss.txt", "--deviation", "0.5"]
+    assert main([*run, "--upright"]) == 0
+    told, method = given[0][2]["positions"], given[0][2]["method"]
+    np.testing.assert_allclose(told.position - told.position[0], fixes - fixes[0])
+    assert float(told.deviation) == 0.5
+    np.testing.assert_array_equal(method.prior.up, [0, 0, 1])
+    for origin, points, file in zip(told.antenna, given[0][0], scans, strict=True):
+        np.testing.assert_allclose(points[0] - origin, np.load(folder / file)[0], 1e-5)
+    Path("gnss.txt").write_text(lines[0])
+    assert main(run) == 2
+    assert "gnss.txt: has no position of s1, s2" in capsys.readouterr().err
+    assert main(["multiview", *scans, "--deviation", "0"]) == 2
+    assert "--deviation 0.0: wanted a number above zero" in capsys.readouterr().err
+
+
 def test_truth_adds_errors(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
