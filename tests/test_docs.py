@@ -14,9 +14,10 @@ import pytest
 from helpers import blob, switched_on
 
 import jaxreg as jr
+from jaxreg.cloud import OTHER_UNIT
 from jaxreg.correlation import ascent
 from jaxreg.local import curvature
-from jaxreg.multiview import place, prepare
+from jaxreg.multiview import place
 from jaxreg.particle import conclude
 
 
@@ -27,7 +28,7 @@ THRESHOLDS = {
     jr.Status.LOW_OVERLAP: (float(jnp.asarray(jr.ParticleFilter().min_log_evidence)),),
     jr.Status.AMBIGUOUS: (conclude.RIVAL_MARGIN,),
     jr.Status.DISCONNECTED: (place._MIN_TRUST,),
-    jr.Status.UNIT_DIFFERS: (prepare._OTHER_UNIT,),
+    jr.Status.UNIT_DIFFERS: (OTHER_UNIT,),
 }
 
 

@@ -71,8 +71,7 @@ def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, jax.Array]:
     ready = prepare_pair(ParticleFilter(), tuple(map(jnp.asarray, clouds)))
     pair = ready.source, ready.target
     indexes = (BruteForce.build(cloud.points, cloud.mask) for cloud in pair)
-    prepared = Prepared(*pair, *indexes)
-    witness = prepared.witness(prepared.exact)
+    witness = Prepared(*pair, *indexes).judged.exact.witness
     (there, back), (own, other) = witness.problems, witness.spacings
 
     def of_pose(T: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -12,9 +12,27 @@ from jaxtyping import Array
 from jaxreg._core.typing import Key
 
 
+#: A rotation this far from orthonormal is projected, one further is refused.
+ROTATION_TOLERANCE = 1e-2
+
+
 def is_concrete(x: Any) -> bool:
     """True where the values can be read, False while tracing."""
     return not isinstance(x, Tracer)
+
+
+def as_host_array(x: object, name: str) -> np.ndarray:
+    """Converts what `numpy.asarray` or DLPack takes to a NumPy array of numbers."""
+    if hasattr(x, "__dlpack__") and not isinstance(x, np.ndarray):
+        x = np.from_dlpack(x)  # pyright: ignore[reportArgumentType]
+    try:
+        x = np.asarray(x)
+    except ValueError as err:
+        raise ValueError(f"{name}: not a rectangular array of numbers.") from err
+    if x.dtype == object or x.dtype.kind in "SUV":
+        hint = "" if x.dtype == object else " Files are read by jaxreg.io."
+        raise TypeError(f"{name}: wanted numbers, found dtype {x.dtype}.{hint}")
+    return x
 
 
 def as_float_array(x: object, name: str) -> Array:
@@ -28,15 +46,7 @@ def as_float_array(x: object, name: str) -> Array:
         name: how error messages call the argument.
     """
     if not isinstance(x, jax.Array):
-        if hasattr(x, "__dlpack__") and not isinstance(x, np.ndarray):
-            x = np.from_dlpack(x)  # pyright: ignore[reportArgumentType]
-        try:
-            x = np.asarray(x)
-        except ValueError as err:
-            raise ValueError(f"{name}: not a rectangular array of numbers.") from err
-        if x.dtype == object or x.dtype.kind in "SUV":
-            hint = "" if x.dtype == object else " Files are read by jaxreg.io."
-            raise TypeError(f"{name}: wanted numbers, found dtype {x.dtype}.{hint}")
+        x = as_host_array(x, name)
         if x.dtype == np.float64 and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
             x = x.astype(np.float32)
     # Of NumPy arrays `jnp.asarray` compiles a program for each size.
@@ -103,6 +113,25 @@ def check_motion(T: Array, d: int, name: str) -> None:
         raise ValueError(
             f"{name}: wanted homogeneous matrices of shape (..., {d + 1}, {d + 1}), "
             f"found {T.shape}."
+        )
+
+
+def check_rigid(T: Array, name: str) -> None:
+    """Requires rotations without scale or reflection; traced ones are not looked at.
+
+    Nor are those that are not finite: they end in a status.
+    """
+    if not is_concrete(T):
+        return
+    R = np.asarray(T, np.float64)[..., :-1, :-1]
+    R = R.reshape(-1, *R.shape[-2:])
+    R = R[np.all(np.isfinite(R), axis=(1, 2))]
+    gram = np.einsum("bij,bik->bjk", R, R)
+    worst = np.max(np.abs(gram - np.eye(R.shape[-1])), initial=0)
+    if worst > ROTATION_TOLERANCE or np.any(np.linalg.det(R) < 0):
+        raise ValueError(
+            f"{name}: wanted rigid motions, found a rotation that is not orthonormal "
+            f"within {ROTATION_TOLERANCE:g} or is a reflection."
         )
 
 

@@ -68,8 +68,8 @@ _ADVICE = {
         "Start nearer, use a robust kernel, or search with ParticleFilter."
     ),
     Status.UNIT_DIFFERS: (
-        "The scan is many times larger or smaller than the others, and was left out. "
-        "Is it in another unit? Bring all scans to one unit."
+        "The scan is more than 50 times larger or smaller than the other or others, "
+        "and does not fit. Is it in another unit? Bring all scans to one unit."
     ),
     Status.NO_AGREEMENT: (
         "No motions agree with each other beyond what any tree of them agrees with by "

@@ -14,6 +14,10 @@ from jaxreg.cloud.point_cloud import centroid, rms_radius
 from jaxreg.geometry import lie
 
 
+#: A cloud this many times larger or smaller than others is in another unit.
+OTHER_UNIT = 50.0
+
+
 class Side(eqx.Module):
     """A cloud as given, cleaned.
 

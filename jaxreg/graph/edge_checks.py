@@ -7,11 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxreg._core.checks import as_float_array, is_concrete
-
-
-#: A motion whose rotation is this far from orthonormal is projected, further refused.
-ROTATION_TOLERANCE = 1e-2
+from jaxreg._core.checks import ROTATION_TOLERANCE, as_float_array, is_concrete
 
 
 class EdgeError(ValueError):

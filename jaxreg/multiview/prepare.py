@@ -8,17 +8,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motions, Scalar
-from jaxreg.cloud import Frames, PointCloud, centroid, median_spacing, rms_radius
+from jaxreg.cloud import (
+    OTHER_UNIT,
+    Frames,
+    PointCloud,
+    centroid,
+    median_spacing,
+    rms_radius,
+)
 from jaxreg.geometry import lie
 from jaxreg.matching import Witness
 from jaxreg.multiview.method import index_of
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.neighbours import AbstractIndex, index_within
 from jaxreg.registrar import AbstractRegistrar
-
-
-# A scan this many times larger or smaller than the median is in another unit.
-_OTHER_UNIT = 50.0
 
 
 class PreparedScans(eqx.Module):
@@ -171,7 +174,7 @@ def _fault(
     clouds: PointCloud, size: Float[Array, " v"], spacing: Float[Array, " v"]
 ) -> Int[Array, " v"]:
     """What is wrong with each scan, see `PreparedScans`."""
-    differs = (size > _OTHER_UNIT) | (size < 1 / _OTHER_UNIT)
+    differs = (size > OTHER_UNIT) | (size < 1 / OTHER_UNIT)
     fault = jnp.where(differs, Status.UNIT_DIFFERS, Status.CONVERGED)
     enough = (jnp.sum(clouds.mask, axis=1) > clouds.points.shape[-1]) & (spacing > 0)
     return jnp.where(enough, fault, Status.TOO_FEW_POINTS).astype(jnp.int32)

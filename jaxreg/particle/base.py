@@ -229,6 +229,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
         judged = self.refine_steps > 0 and pair.source.points.shape[1] == 3
         if not (self.num_proposals and anywhere and judged):
             return None
+        pair = pair.judged
         return propose_modes(
             pair.source,
             pair.target,

@@ -85,16 +85,20 @@ def conclude(
     if log_prior is not None:
         last = jax.vmap(log_prior)(particles.T_target_source) < -_MOST_EVIDENCE
     rows, mass = distinct_modes(particles, num_modes, last, angle=limit, distance=limit)
-    spacing, exact = pair.spacing, pair.exact
-    witness = pair.witness(exact)
+    spacing, exact, judged = pair.spacing, pair.exact, pair.judged
+    witness = (exact if judged is pair else judged.exact).witness
     T_modes = particles.T_target_source[rows]
     if proposals is not None:
         T_more, in_use = proposals
         T_modes = jnp.concatenate([T_modes, T_more])
         mass = jnp.concatenate([mass, in_use.astype(dtype)])
-    T_modes, sound = _refined(
-        pair.problem, kernel, T_modes, mass > 0, spacing, refine_steps
+    widths = jnp.geomspace(
+        2 * jnp.maximum(spacing, judged.spacing),
+        0.5 * spacing,
+        refine_steps,
+        dtype=dtype,
     )
+    T_modes, sound = _refined(pair.problem, kernel, T_modes, mass > 0, widths)
     evidence = witness.of_poses(T_modes, sound)
     if log_prior is not None:
         told = evidence.log_evidence + jax.vmap(log_prior)(T_modes)
@@ -202,17 +206,15 @@ def _refined(
     kernel: AbstractKernel,
     T: Float[Array, "q D D"],
     used: Bool[Array, " q"],
-    spacing: Scalar,
-    num_steps: int,
+    widths: Float[Array, " s"],
 ) -> tuple[Float[Array, "q D D"], Bool[Array, " q"]]:
-    """After many steps on all points, the width falling to the sample spacing.
+    """After a step of each width on all points.
 
     And which of the poses in use are sound; the others become the identity.
     """
     optimiser = LocalOptimiser(PointToPlane(), kernel, GaussNewton())
     optimiser = cast_floats(optimiser, T.dtype)
-    if num_steps:
-        widths = spacing * jnp.geomspace(2, 0.5, num_steps, dtype=T.dtype)
+    if len(widths):
         T = _of_used(lambda T: optimiser.repeat(problem, T, widths), T, used)
     T = lie.orthonormalise(T)
     sound = used & jnp.all(jnp.isfinite(T), axis=(1, 2))

@@ -41,14 +41,19 @@ class Pair(eqx.Module):
         pair = Pair(source, target, self.source_index, self.target_index)
         return pair.exact
 
-    def witness(self, exact: "Pair") -> Witness:
-        """Who tells how likely poses are; `exact` is that of this pair."""
-        source, target = self.source.judged, self.target.judged
-        if source is not None or target is not None:
-            clouds = levelled(self.source.as_judged, self.target.as_judged)
-            exact = Pair(*clouds, self.source_index, self.target_index).exact
-        clouds = exact.source, exact.target
-        return Witness.of(*clouds, exact.source_index, exact.target_index)
+    @property
+    def judged(self) -> "Pair":
+        """With as many points as poses are judged by; itself if these are as many."""
+        if self.source.judged is None and self.target.judged is None:
+            return self
+        clouds = levelled(self.source.as_judged, self.target.as_judged)
+        return Pair(*clouds, self.source_index, self.target_index)
+
+    @property
+    def witness(self) -> Witness:
+        """Who tells how likely poses are."""
+        clouds = self.source, self.target
+        return Witness.of(*clouds, self.source_index, self.target_index)
 
     @property
     def spacing(self) -> Scalar:

@@ -1,11 +1,13 @@
 """A pair as a method's `solve` expects it: cleaned, centred and scaled, prepared."""
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxreg._core.arrays import on_both
-from jaxreg.cloud import Frames, PointCloud, Side
+from jaxreg.cloud import OTHER_UNIT, Frames, PointCloud, Side
 from jaxreg.registrar.base import AbstractRegistrar
 
 
@@ -21,6 +23,7 @@ class PreparedPair(eqx.Module):
         source, target: prepared clouds.
         frames: the centred ones and those of the input.
         enough: whether both clouds have at least d + 1 distinct valid points.
+        unit_differs: whether one is so much larger that its unit must be another.
     """
 
     method: AbstractRegistrar
@@ -28,6 +31,7 @@ class PreparedPair(eqx.Module):
     target: PointCloud
     frames: Frames
     enough: Bool[Array, ""]
+    unit_differs: Bool[Array, ""]
 
 
 def prepare_pair(method: AbstractRegistrar, pair: tuple[Array, ...]) -> PreparedPair:
@@ -48,6 +52,7 @@ def prepare_pair(method: AbstractRegistrar, pair: tuple[Array, ...]) -> Prepared
         target_cloud.first(len(target)),
         frames,
         sides[0].enough & sides[1].enough,
+        jnp.abs(jnp.log(sides[0].radius / sides[1].radius)) > math.log(OTHER_UNIT),
     )
 
 

@@ -19,6 +19,10 @@ from jaxreg.registrar import (
 )
 
 
+# What clouds in different units end in, whatever the method.
+_DOUBTED = Status.LOW_OVERLAP, Status.AMBIGUOUS, Status.DIVERGED
+
+
 def register_pair(
     method: AbstractRegistrar,
     pair: tuple[Array, ...],
@@ -29,6 +33,11 @@ def register_pair(
     ready = prepare_pair(method, pair)
     init = None if init is None else ready.frames.enter(init)
     solution = ready.method.solve(ready.source, ready.target, init, key)
+    doubted = jnp.isin(solution.status, jnp.array(_DOUBTED))
+    status = jnp.where(
+        ready.unit_differs & doubted, Status.UNIT_DIFFERS, solution.status
+    )
+    solution = dataclasses.replace(solution, status=status.astype(jnp.int32))
     return _in_input_frames(solution, ready.frames, ready.enough)
 
 

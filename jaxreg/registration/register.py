@@ -15,6 +15,7 @@ from jaxreg._core.checks import (
     check_key,
     check_motion,
     check_pair,
+    check_rigid,
     is_concrete,
 )
 from jaxreg._core.typing import ArrayLike, Key, Progress
@@ -26,6 +27,12 @@ from jaxreg.batching.padding import (
 )
 from jaxreg.particle import ParticleFilter
 from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
+from jaxreg.registration.far import (
+    check_prior_fits,
+    moved_back,
+    moved_guess,
+    near_origin,
+)
 from jaxreg.registration.many import register_batch, register_lists
 from jaxreg.registration.pair import register_pair
 
@@ -108,7 +115,9 @@ def register(
 
     Returns:
         A `RegistrationSolution`, with leading axes for a batch; for lists a list of
-        them, one for each pair.
+        them, one for each pair. Of NumPy arrays of float64 that lie a hundred radii
+        from their origins, as map coordinates do, poses are NumPy arrays of float64,
+        also where JAX computes in float32: clouds are moved to their middles first.
 
     Raises:
         ValueError, TypeError: while tracing, for shapes, dtypes and keys that do not
@@ -116,7 +125,8 @@ def register(
 
     Fails:
         With the statuses of the method; TOO_FEW_POINTS where a cloud has fewer than
-        d + 1 distinct valid points, and then the pose is the identity.
+        d + 1 distinct valid points, and then the pose is the identity; UNIT_DIFFERS
+        where one that is not believed has 50 times the radius of the other.
 
     Gradients:
         As the method says.
@@ -141,17 +151,24 @@ def register(
     check_count(batch_size, "batch_size")
     key = None if key is None else check_key(key)
     masks = source_mask, target_mask
+    here = near_origin(source, source_mask, "source")
+    there = near_origin(target, target_mask, "target")
+    check_prior_fits(method, here, there)
+    init = moved_guess(init, here, there)
     if is_list_of_clouds(source) or is_list_of_clouds(target):
-        lists = check_lists(source, target, *masks)
+        lists = check_lists(here.points, there.points, *masks)
         batch = (len(lists[0]),)
         init = _check_init(init, batch, lists[0][0])
-        return register_lists(method, lists, init, key, batch_size, progress)
-    pair = check_pair(source, target, *masks)
+        found = register_lists(method, lists, init, key, batch_size, progress)
+        return [moved_back(sol, here.at(i), there.at(i)) for i, sol in enumerate(found)]
+    pair = check_pair(here.points, there.points, *masks)
     batch = pair[0].shape[:-2]
     init = _check_init(init, batch, pair[0])
-    if not batch:
-        return _register_one(method, _rounded_up(pair), init, key)
-    return register_batch(method, batch, pair, init, key, batch_size, progress)
+    if batch:
+        sol = register_batch(method, batch, pair, init, key, batch_size, progress)
+    else:
+        sol = _register_one(method, _rounded_up(pair), init, key)
+    return moved_back(sol, here, there)
 
 
 def _check_init(
@@ -162,6 +179,7 @@ def _check_init(
         return None
     found, d = as_float_array(init, "init").astype(points.dtype), points.shape[-1]
     check_motion(found, d, "init")
+    check_rigid(found, "init")
     try:
         return jnp.broadcast_to(found, (*batch, d + 1, d + 1))
     except ValueError as err:

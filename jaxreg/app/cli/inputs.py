@@ -7,6 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from jaxreg.cloud import OTHER_UNIT
 from jaxreg.io.errors import InputError
 from jaxreg.io.points.read import (
     point_files,
@@ -17,8 +18,6 @@ from jaxreg.io.points.read import (
 from jaxreg.io.rows import numbers, read_lines
 
 
-# Scans whose extents differ by such a factor are taken to be in different units.
-_OTHER_UNIT = 50.0
 # Registration draws some thousand points of a scan, pictures some hundred thousand.
 _MAX_POINTS = 2_000_000
 
@@ -119,7 +118,7 @@ def _require_one_unit(scans: Scans) -> None:
     usual = np.median(extents)
     for place, extent in zip(scans.places, extents, strict=True):
         ratio = extent / usual if usual > 0 else 1.0
-        if ratio > _OTHER_UNIT or 0 < ratio < 1 / _OTHER_UNIT:
+        if ratio > OTHER_UNIT or 0 < ratio < 1 / OTHER_UNIT:
             raise InputError(
                 f"{place}: spans {extent:.4g}, the others about {usual:.4g}: is it in "
                 "another unit?\nScale it to the unit of the others, or leave it out."

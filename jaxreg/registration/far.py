@@ -1,0 +1,146 @@
+"""Clouds far from their origins, such as map coordinates in float64.
+
+Cast to float32 they would be rounded to half a metre. They are moved to their middles
+before, in float64 on the host, and the poses that are found are moved back there.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxreg._core.checks import as_host_array
+from jaxreg._core.typing import ArrayLike
+from jaxreg.batching.padding import is_list_of_clouds
+from jaxreg.particle import AbstractSearch, GivenParticles, PartialPose
+from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
+
+
+# A cloud so many radii from the origin loses two of the seven digits of float32.
+_FAR = 100.0
+
+
+class Moved(NamedTuple):
+    """A cloud, a batch or a list of them, and the `(..., d)` origins they are about.
+
+    The origins are None where nothing was moved: of clouds near their origins, of what
+    JAX holds already, and where JAX computes in float64.
+    """
+
+    points: object
+    origin: np.ndarray | None
+
+    def at(self, i: int) -> "Moved":
+        """One of a list."""
+        return Moved(None, None if self.origin is None else self.origin[i])
+
+
+def near_origin(points: object, mask: object, name: str) -> Moved:
+    """Clouds moved to their middles where they are far from their origins."""
+    if isinstance(points, jax.Array) or jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        return Moved(points, None)
+    if isinstance(points, list | tuple) and is_list_of_clouds(points):
+        masks = mask if isinstance(mask, list | tuple) else [None] * len(points)
+        each = [
+            near_origin(x, m, f"{name}[{i}]")
+            for i, (x, m) in enumerate(zip(points, masks, strict=False))
+        ]
+        if len(each) < len(points) or all(x.origin is None for x in each):
+            return Moved(points, None)
+        zero = np.zeros(np.shape(points[0])[-1])
+        origins = [zero if x.origin is None else x.origin for x in each]
+        return Moved([x.points for x in each], np.stack(origins))
+    found = as_host_array(points, name)
+    valid = np.ones(found.shape[:-1], bool) if mask is None else np.asarray(mask, bool)
+    exact = found.dtype == np.float64 or found.dtype.kind in "iu"
+    if not exact or found.ndim < 2 or valid.shape != found.shape[:-1]:
+        return Moved(points, None)
+    origin = _middles(found, valid)
+    if not np.any(origin):
+        return Moved(points, None)
+    return Moved(found - origin[..., None, :], origin)
+
+
+def _middles(points: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """`(..., d)` means of the valid finite rows; zero of clouds that are near."""
+    valid = (valid & np.all(np.isfinite(points), axis=-1))[..., None]
+    num = np.maximum(np.sum(valid, axis=-2), 1)
+    mean = np.sum(points, axis=-2, where=valid, dtype=np.float64) / num
+    offset = points - mean[..., None, :]
+    sq = np.sum(offset**2, axis=(-2, -1), where=valid) / num[..., 0]
+    far = np.sum(mean**2, axis=-1) > _FAR**2 * sq
+    return np.where(far[..., None], mean, 0)
+
+
+def check_prior_fits(method: AbstractRegistrar, source: Moved, target: Moved) -> None:
+    """Requires that a prior holds no poses between frames that were moved."""
+    if source.origin is None and target.origin is None:
+        return
+    prior = method.prior if isinstance(method, AbstractSearch) else None
+    if isinstance(prior, GivenParticles) or (
+        isinstance(prior, PartialPose) and prior.position is not None
+    ):
+        raise ValueError(
+            f"{type(prior).__name__}: source and target are far from their origins and "
+            "are moved; subtract their middles, and give poses between what is left."
+        )
+
+
+def moved_guess(
+    init: ArrayLike | None, source: Moved, target: Moved
+) -> ArrayLike | None:
+    """A guess between the frames of the input as one between those of the search."""
+    if init is None or (source.origin is None and target.origin is None):
+        return init
+    T = np.asarray(as_host_array(init, "init"), np.float64)
+    here, there = _origins(source, target, T.shape[-1] - 1)
+    return _with_translation(T, T[..., :-1, -1] + _turned(T, here) - there)
+
+
+def moved_back(
+    solution: RegistrationSolution, source: Moved, target: Moved
+) -> RegistrationSolution:
+    """A solution with poses between the frames of the input, in float64 on the host."""
+    if source.origin is None and target.origin is None:
+        return solution
+    d = solution.T_target_source.shape[-1] - 1
+    here, there = _origins(source, target, d)
+
+    def back(T: jax.Array, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+        out = _orthonormal(np.asarray(T, np.float64))
+        return _with_translation(out, out[..., :-1, -1] + there - _turned(out, here))
+
+    T = back(solution.T_target_source, here, there)
+    modes = solution.modes.T_target_source
+    modes = back(modes, here[..., None, :], there[..., None, :])
+    # Not by the constructor: JAX without x64 has no such arrays.
+    return eqx.tree_at(
+        lambda s: (s.T_target_source, s.modes.T_target_source), solution, (T, modes)
+    )
+
+
+def _origins(source: Moved, target: Moved, d: int) -> tuple[np.ndarray, np.ndarray]:
+    here, there = (
+        np.zeros(d) if x.origin is None else x.origin for x in (source, target)
+    )
+    return here, there
+
+
+def _turned(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return np.einsum("...ij,...j->...i", T[..., :-1, :-1], points)
+
+
+def _with_translation(T: np.ndarray, t: np.ndarray) -> np.ndarray:
+    shape = np.broadcast_shapes(T.shape[:-2], t.shape[:-1])
+    out = np.broadcast_to(T, (*shape, *T.shape[-2:])).copy()
+    out[..., :-1, -1] = t
+    return out
+
+
+def _orthonormal(T: np.ndarray) -> np.ndarray:
+    """To the last digit: seven of a rotation are a metre at a million metres."""
+    U, _, Vt = np.linalg.svd(T[..., :-1, :-1])
+    out = T.copy()
+    out[..., :-1, :-1] = U @ Vt
+    return out

@@ -1,0 +1,97 @@
+"""Clouds far from their origins, clouds in other units, guesses that are not rigid."""
+
+import jax
+import numpy as np
+import pytest
+from helpers import blob, motion, move, pose_error
+
+import jaxreg as jr
+from jaxreg import Status, particle
+
+
+MIDDLES = np.array([500_000.0, 4_200_000.0, 120.0]), np.array([-3e6, 7e5, 900.0])
+
+
+def _far(seed, middles=MIDDLES):
+    """A pair on the map, and the pose between it."""
+    T = motion(seed, 3, angle=0.2, shift=0.1)
+    target = 5 * blob(900, 3, 1).astype(np.float64)
+    source = 5 * blob(900, 3, 2).astype(np.float64)
+    source = move(np.linalg.inv(T), source) + middles[0]
+    T_far = T.copy()
+    T_far[:3, 3] += middles[1] - T[:3, :3] @ middles[0]
+    return source, target + middles[1], T_far
+
+
+def _gap(T, T_true, source):
+    """The greatest distance between images of the source, in its unit."""
+    return np.max(np.linalg.norm(move(T, source) - move(T_true, source), axis=1))
+
+
+def test_map_coordinates_keep_their_digits():
+    source, target, T_true = _far(0)
+    sol = jr.register(source, target, jr.ICP(), init=T_true)
+    assert int(sol.status) == Status.CONVERGED
+    assert sol.T_target_source.dtype == np.float64
+    assert _gap(sol.T_target_source, T_true, source) < 0.05
+    np.testing.assert_array_equal(sol.T_target_source, sol.modes.T_target_source[0])
+    R = sol.T_target_source[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+    near, middle = source - MIDDLES[0], target - MIDDLES[1]
+    near[np.isnan(near)] = 0
+    T = jr.register(near, middle, jr.ICP(), init=motion(0, 3, angle=0.2, shift=0.1))
+    assert isinstance(T.T_target_source, jax.Array)
+    assert pose_error(T.T_target_source, R_and_t(sol.T_target_source))[0] < 1e-4
+
+
+def R_and_t(T):
+    """The same pose between clouds about their middles."""
+    out = T.copy()
+    out[:3, 3] += T[:3, :3] @ MIDDLES[0] - MIDDLES[1]
+    return out
+
+
+def test_lists_and_batches_of_map_coordinates():
+    pairs = [_far(0), _far(1, (MIDDLES[0], np.zeros(3)))]
+    sources, targets, truth = (list(x) for x in zip(*pairs, strict=True))
+    found = jr.register(sources, targets, jr.ICP(), init=np.array(truth))
+    batch = jr.register(
+        np.array(sources), np.array(targets), jr.ICP(), init=np.array(truth)
+    )
+    for k, sol in enumerate(found):
+        assert _gap(sol.T_target_source, truth[k], sources[k]) < 0.05
+        assert _gap(batch.T_target_source[k], truth[k], sources[k]) < 0.05
+
+
+def test_rows_that_are_masked_do_not_tell_where_a_cloud_is():
+    source, target, T_true = _far(0)
+    padded = np.concatenate([source, np.zeros((900, 3))])
+    mask = np.arange(1800) < 900
+    sol = jr.register(padded, target, jr.ICP(), init=T_true, source_mask=mask)
+    assert _gap(sol.T_target_source, T_true, source) < 0.05
+
+
+def test_a_position_between_map_coordinates_is_refused():
+    source, target, _ = _far(0)
+    prior = particle.PartialPose(position=(0, 0, 0))
+    with pytest.raises(ValueError, match="subtract their middles"):
+        jr.register(
+            source, target, jr.ParticleFilter(prior=prior), key=jax.random.key(0)
+        )
+
+
+@pytest.mark.parametrize("scale", [(1, 1000), (1000, 1)])
+def test_metres_on_millimetres_are_told(scale):
+    source, target, T = _far(0, (np.zeros(3), np.zeros(3)))
+    sol = jr.register(scale[0] * source, scale[1] * target, jr.ICP(), init=T)
+    assert int(sol.status) == Status.UNIT_DIFFERS
+
+
+@pytest.mark.parametrize("scale", [(2, 2, 2), (1, 1, -1)])
+def test_a_guess_that_is_not_rigid_is_refused(scale):
+    source, target, T = _far(0, (np.zeros(3), np.zeros(3)))
+    bent = T @ np.diag([*scale, 1])
+    with pytest.raises(ValueError, match="init: wanted rigid motions"):
+        jr.register(source, target, jr.ICP(), init=bent)
+    with pytest.raises(ValueError, match="init: wanted rigid motions"):
+        jr.register([source], [target], jr.ICP(), init=bent[None])
