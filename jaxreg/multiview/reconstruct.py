@@ -18,6 +18,7 @@ from jaxreg.averaging import AbstractAverager
 from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
 from jaxreg.multiview.choose_pairs import Order, all_pairs, first_pairs
 from jaxreg.multiview.conclude import finish
+from jaxreg.multiview.far_scans import FarScans
 from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.prepare import PreparedScans, prepare_scans
@@ -78,7 +79,8 @@ def reconstruct(
             found, in the input's frames and unit; not under `jit`.
 
     Returns:
-        A `ReconstructionSolution`.
+        A `ReconstructionSolution`. Of NumPy arrays of float64 in map coordinates, see
+        `register`, its poses and motions are NumPy arrays of float64.
 
     Raises:
         ValueError, TypeError: while tracing, for shapes and types that do not fit.
@@ -95,8 +97,12 @@ def reconstruct(
     Reference:
         Sandhu, Dambreville, Tannenbaum for the pairs; Zhu et al. for the averaging.
     """
-    points, row_mask = padded_scans(scans, mask)
-    eyes = checked_viewpoints(viewpoints, points, row_mask)
+    check_instance(positions, "positions", ScanPositions | None)
+    far = FarScans(scans, mask)
+    points, row_mask = padded_scans(far.scans, mask)
+    eyes = checked_viewpoints(far.viewpoints(viewpoints), points, row_mask)
+    positions, previous = far.positions(positions), far.previous(previous)
+    on_pairs = far.hears(on_pairs)
     points, eyes = jax.lax.stop_gradient((points, eyes))
     method = ParticleFilter() if method is None else method
     check_instance(method, "method", AbstractRegistrar)
@@ -106,7 +112,6 @@ def reconstruct(
             "hold_previous: wanted a ReconstructionSolution as previous, found "
             f"{type(previous).__name__}."
         )
-    check_instance(positions, "positions", ScanPositions | None)
     if positions is not None:
         positions.check_fits(points, method)
         positions = cast_floats(positions, points.dtype)
@@ -138,7 +143,7 @@ def reconstruct(
     solution = finish(method, averaging, prepared, motions_padded, hold)
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
-    return solution.of_pairs(len(motions.overlap))
+    return far.back(solution.of_pairs(len(motions.overlap)))
 
 
 def _known(

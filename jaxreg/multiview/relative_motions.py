@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -96,6 +97,10 @@ class RelativeMotions(BriefModule):
     @staticmethod
     def joined(some: list["RelativeMotions"]) -> "RelativeMotions":
         """All of them, in ascending order of the scans."""
+        if isinstance(some[0].T_i_j, np.ndarray):  # float64, which JAX may not have
+            every = jax.tree.map(lambda *x: np.concatenate(x), *some)
+            order = np.lexsort((every.pairs[:, 1], every.pairs[:, 0]))
+            return jax.tree.map(lambda x: x[order], every)
         every = jax.tree.map(lambda *x: jnp.concatenate(x), *some)
         return every.rows(jnp.lexsort((every.pairs[:, 1], every.pairs[:, 0])))
 

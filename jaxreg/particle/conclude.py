@@ -2,29 +2,21 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.arrays import cast_floats
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.geometry import lie
-from jaxreg.local import Curvature, GaussNewton, LocalOptimiser
-from jaxreg.matching import (
-    NO_EVIDENCE,
-    Evidence,
-    PlaneToPlane,
-    PointToPlane,
-    Problem,
-    match,
-)
+from jaxreg.local import Curvature
+from jaxreg.matching import NO_EVIDENCE, Evidence
 from jaxreg.particle.last_digits import last_digits
 from jaxreg.particle.modes import distinct_modes, first_within
 from jaxreg.particle.pair import Pair
+from jaxreg.particle.refine import polished, refined
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import Modes, RegistrationSolution
 from jaxreg.robust import AbstractKernel
@@ -46,7 +38,8 @@ _MOST_EVIDENCE = 10.0
 _POLISH = 8
 
 
-Out = TypeVar("Out")
+#: What is known of a pose beforehand, in the frames of the search.
+LogPrior = Callable[[Motion], Scalar]
 
 
 def conclude(
@@ -55,7 +48,7 @@ def conclude(
     num_steps: Int[Array, ""],
     finished: Bool[Array, ""],
     proposals: tuple[Float[Array, "r D D"], Bool[Array, " r"]] | None = None,
-    log_prior: Callable[[Motion], Scalar] | None = None,
+    log_prior: LogPrior | None = None,
     *,
     kernel: AbstractKernel,
     num_modes: int,
@@ -79,70 +72,17 @@ def conclude(
             evidence. Without, by energy: the answer is the particle of least energy.
         min_log_evidence: of less the status is LOW_OVERLAP.
     """
-    dtype = particles.energy.dtype
-    limit = jnp.asarray(APART, dtype)
-    last = None
-    if log_prior is not None:
-        last = jax.vmap(log_prior)(particles.T_target_source) < -_MOST_EVIDENCE
-    rows, mass = distinct_modes(particles, num_modes, last, angle=limit, distance=limit)
-    spacing, exact, judged = pair.spacing, pair.exact, pair.judged
-    witness = (exact if judged is pair else judged.exact).witness
-    T_modes = particles.T_target_source[rows]
-    if proposals is not None:
-        T_more, in_use = proposals
-        T_modes = jnp.concatenate([T_modes, T_more])
-        mass = jnp.concatenate([mass, in_use.astype(dtype)])
-    widths = jnp.geomspace(
-        2 * jnp.maximum(spacing, judged.spacing),
-        0.5 * spacing,
-        refine_steps,
-        dtype=dtype,
-    )
-    T_modes, sound = _refined(pair.problem, kernel, T_modes, mass > 0, widths)
-    evidence = witness.of_poses(T_modes, sound)
-    if log_prior is not None:
-        told = evidence.log_evidence + jax.vmap(log_prior)(T_modes)
-        evidence = dataclasses.replace(evidence, log_evidence=told)
-    sound = sound & ((jnp.arange(len(sound)) < num_modes) | _convincing(evidence))
-    by_evidence = jnp.argsort(-jnp.where(sound, evidence.log_evidence, NO_EVIDENCE))
-    order = by_evidence[:num_modes] if refine_steps else jnp.arange(num_modes)
-    T_modes, mass, sound, evidence = jax.tree.map(
-        lambda x: x[order], (T_modes, mass, sound, evidence)
-    )
-    # Refinement may lead two of them to one pose.
-    first = first_within(T_modes, angle=limit, distance=limit)
-    sound = sound & (first == jnp.arange(num_modes))
-    log_evidence = jnp.where(sound, evidence.log_evidence, NO_EVIDENCE)
-    weight = _weights(log_evidence, sound)
-    mass = weight if refine_steps else mass
-    steps = _POLISH if refine_steps else 0
-    T_modes, curvatures = _polished(
-        exact.problem,
-        kernel,
-        T_modes,
-        sound,
-        log_evidence > log_evidence[0] - _HOPELESS,
-        0.5 * spacing,
-        steps,
-    )
-    best = jax.tree.map(lambda x: x[0], evidence)
-    enough = log_evidence[0] >= min_log_evidence
-    if steps and pair.source.fine is not None:
-        first = T_modes[0], jax.tree.map(lambda x: x[0], curvatures)
-        last = lax.cond(
-            sound[0] & enough,
-            lambda first: last_digits(pair, kernel, first[0], 0.5 * spacing),
-            lambda first: first,
-            first,
-        )
-        T_modes, curvatures = jax.tree.map(
-            lambda x, y: x.at[0].set(y), (T_modes, curvatures), last
-        )
-    curvature = jax.tree.map(lambda x: x[0], curvatures)
-    holds = evidence.grip.holds
-    doubtful = ~holds[0] | _has_rival(log_evidence, holds)
-    finished = finished | (refine_steps > 0)
-    status = _status(sound[0], enough, doubtful, pair, finished)
+    refines = refine_steps > 0
+    poses = _candidates(particles, num_modes, proposals, log_prior)
+    exact = pair.exact
+    found = _judged(pair, exact, kernel, poses, num_modes, refine_steps, log_prior)
+    mass = _weights(found.log_evidence, found.sound) if refines else found.mass
+    enough = found.log_evidence[0] >= min_log_evidence
+    T_modes, curvatures = _accurate(pair, exact, kernel, found, enough, refines)
+    evidence, holds = found.evidence, found.evidence.grip.holds
+    doubtful = ~holds[0] | _has_rival(found.log_evidence, holds)
+    status = _status(found.sound[0], enough, doubtful, pair, finished | refines)
+    best, curvature = jax.tree.map(lambda x: x[0], (evidence, curvatures))
     return RegistrationSolution(
         T_target_source=T_modes[0],
         status=status,
@@ -150,7 +90,7 @@ def conclude(
         inlier_rmse=best.inlier_rmse,
         num_inliers=best.num_inliers,
         overlap=best.overlap,
-        log_evidence=log_evidence[0],
+        log_evidence=found.log_evidence[0],
         num_steps=(num_steps + refine_steps).astype(jnp.int32),
         H=curvature.H,
         b=curvature.b,
@@ -160,12 +100,105 @@ def conclude(
             T_modes,
             mass,
             evidence.fitness,
-            jnp.where(sound, evidence.overlap, 0),
+            jnp.where(found.sound, evidence.overlap, 0),
             evidence.inlier_rmse,
-            log_evidence,
+            found.log_evidence,
             curvatures.covariance,
         ),
     )
+
+
+class _Candidates(NamedTuple):
+    """Poses that may be the answer, with their weights, judged; best first."""
+
+    T: Float[Array, "q D D"]
+    mass: Float[Array, " q"]
+    sound: Bool[Array, " q"]
+    evidence: Evidence
+
+    @property
+    def log_evidence(self) -> Float[Array, " q"]:
+        """Of each; `NO_EVIDENCE` of those that are no modes."""
+        return jnp.where(self.sound, self.evidence.log_evidence, NO_EVIDENCE)
+
+
+def _candidates(
+    particles: Particles,
+    num_modes: int,
+    proposals: tuple[Float[Array, "r D D"], Bool[Array, " r"]] | None,
+    log_prior: LogPrior | None,
+) -> tuple[Float[Array, "q D D"], Float[Array, " q"]]:
+    """Distinct poses of the particles and what is proposed beside, with weights."""
+    limit, last = jnp.asarray(APART, particles.energy.dtype), None
+    if log_prior is not None:
+        last = jax.vmap(log_prior)(particles.T_target_source) < -_MOST_EVIDENCE
+    rows, mass = distinct_modes(particles, num_modes, last, angle=limit, distance=limit)
+    T = particles.T_target_source[rows]
+    if proposals is None:
+        return T, mass
+    T_more, in_use = proposals
+    more = in_use.astype(mass.dtype)
+    return jnp.concatenate([T, T_more]), jnp.concatenate([mass, more])
+
+
+def _judged(
+    pair: Pair,
+    exact: Pair,
+    kernel: AbstractKernel,
+    candidates: tuple[Float[Array, "q D D"], Float[Array, " q"]],
+    num_modes: int,
+    refine_steps: int,
+    log_prior: LogPrior | None,
+) -> _Candidates:
+    """The candidates refined, those of most evidence first; as many as modes."""
+    T, mass = candidates
+    judged, spacing = pair.judged, pair.spacing
+    widths = jnp.geomspace(
+        2 * jnp.maximum(spacing, judged.spacing),
+        0.5 * spacing,
+        refine_steps,
+        dtype=T.dtype,
+    )
+    T, sound = refined(pair.problem, kernel, T, mass > 0, widths)
+    evidence = (exact if judged is pair else judged.exact).witness.of_poses(T, sound)
+    if log_prior is not None:
+        told = evidence.log_evidence + jax.vmap(log_prior)(T)
+        evidence = dataclasses.replace(evidence, log_evidence=told)
+    sound = sound & ((jnp.arange(len(sound)) < num_modes) | _convincing(evidence))
+    found = _Candidates(T, mass, sound, evidence)
+    order = jnp.arange(num_modes)
+    if refine_steps:
+        order = jnp.argsort(-found.log_evidence)[:num_modes]
+    found = jax.tree.map(lambda x: x[order], found)
+    # Refinement may lead two of them to one pose.
+    limit = jnp.asarray(APART, T.dtype)
+    first = first_within(found.T, angle=limit, distance=limit)
+    return found._replace(sound=found.sound & (first == jnp.arange(num_modes)))
+
+
+def _accurate(
+    pair: Pair,
+    exact: Pair,
+    kernel: AbstractKernel,
+    found: _Candidates,
+    enough: Bool[Array, ""],
+    refines: bool,
+) -> tuple[Float[Array, "q D D"], Curvature]:
+    """The poses after their last steps, and the curvatures there."""
+    log_evidence, sound = found.log_evidence, found.sound
+    hopeful = log_evidence > log_evidence[0] - _HOPELESS
+    width, steps = 0.5 * pair.spacing, _POLISH if refines else 0
+    every = polished(exact.problem, kernel, found.T, sound, hopeful, width, steps)
+    if not steps or pair.source.fine is None:
+        return every
+    first = jax.tree.map(lambda x: x[0], every)
+    last = lax.cond(
+        sound[0] & enough,
+        lambda first: last_digits(pair, kernel, first[0], width),
+        lambda first: first,
+        first,
+    )
+    return jax.tree.map(lambda x, y: x.at[0].set(y), every, last)
 
 
 def _convincing(evidence: Evidence) -> Bool[Array, " q"]:
@@ -199,72 +232,6 @@ def _weights(
     tiny = jnp.finfo(relative.dtype).tiny
     weight = jnp.where(used, jnp.maximum(relative, tiny), 0)
     return weight / jnp.maximum(jnp.sum(weight), tiny)
-
-
-def _refined(
-    problem: Problem,
-    kernel: AbstractKernel,
-    T: Float[Array, "q D D"],
-    used: Bool[Array, " q"],
-    widths: Float[Array, " s"],
-) -> tuple[Float[Array, "q D D"], Bool[Array, " q"]]:
-    """After a step of each width on all points.
-
-    And which of the poses in use are sound; the others become the identity.
-    """
-    optimiser = LocalOptimiser(PointToPlane(), kernel, GaussNewton())
-    optimiser = cast_floats(optimiser, T.dtype)
-    if len(widths):
-        T = _of_used(lambda T: optimiser.repeat(problem, T, widths), T, used)
-    T = lie.orthonormalise(T)
-    sound = used & jnp.all(jnp.isfinite(T), axis=(1, 2))
-    eye = lie.identity(T.shape[-1] - 1, T.dtype)
-    return jnp.where(sound[:, None, None], T, eye), sound
-
-
-def _polished(
-    problem: Problem,
-    kernel: AbstractKernel,
-    T: Float[Array, "q D D"],
-    sound: Bool[Array, " q"],
-    hopeful: Bool[Array, " q"],
-    width: Scalar,
-    num_steps: int,
-) -> tuple[Float[Array, "q D D"], Curvature]:
-    """The last steps, in the metric of both surfaces, and the curvature there.
-
-    Three times as accurate as planes of the target alone; but modes are compared
-    before, as wrong ones gain more by it than right ones. What is no mode stays, and so
-    do those without hope, which have a curvature only.
-    """
-    optimiser = LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton())
-    optimiser = cast_floats(optimiser, T.dtype)
-
-    def polish(T: Motion) -> Motion:
-        return lie.orthonormalise(
-            optimiser.repeat(problem, T, jnp.full(num_steps, width))
-        )
-
-    def curvature_at(T: Motion) -> Curvature:
-        return Curvature.of(optimiser, problem, T, match(problem, T), width)
-
-    polished = _of_used(polish, T, sound & hopeful)
-    T = jnp.where((sound & hopeful)[:, None, None], polished, T)
-    return T, _of_used(curvature_at, T, sound)
-
-
-def _of_used(
-    function: Callable[[Motion], Out], T: Float[Array, "q D D"], used: Bool[Array, " q"]
-) -> Out:
-    """Of each pose in use, one after another; zero of the others."""
-
-    def one(mode: tuple[Motion, Bool[Array, ""]]) -> Out:
-        T, used = mode
-        shapes = jax.eval_shape(function, T)
-        zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return lax.cond(used, function, lambda _: zero, T)
-
-    return lax.map(one, (T, used))
 
 
 def _status(

@@ -69,7 +69,7 @@ def _middles(points: np.ndarray, valid: np.ndarray) -> np.ndarray:
     mean = np.sum(points, axis=-2, where=valid, dtype=np.float64) / num
     offset = points - mean[..., None, :]
     sq = np.sum(offset**2, axis=(-2, -1), where=valid) / num[..., 0]
-    far = np.sum(mean**2, axis=-1) > _FAR**2 * sq
+    far = (sq > 0) & (np.sum(mean**2, axis=-1) > _FAR**2 * sq)
     return np.where(far[..., None], mean, 0)
 
 
@@ -94,8 +94,7 @@ def moved_guess(
     if init is None or (source.origin is None and target.origin is None):
         return init
     T = np.asarray(as_host_array(init, "init"), np.float64)
-    here, there = _origins(source, target, T.shape[-1] - 1)
-    return _with_translation(T, T[..., :-1, -1] + _turned(T, here) - there)
+    return pose_moved(T, *_origins(source, target, T.shape[-1] - 1))
 
 
 def moved_back(
@@ -106,18 +105,25 @@ def moved_back(
         return solution
     d = solution.T_target_source.shape[-1] - 1
     here, there = _origins(source, target, d)
-
-    def back(T: jax.Array, here: np.ndarray, there: np.ndarray) -> np.ndarray:
-        out = _orthonormal(np.asarray(T, np.float64))
-        return _with_translation(out, out[..., :-1, -1] + there - _turned(out, here))
-
-    T = back(solution.T_target_source, here, there)
+    T = pose_back(solution.T_target_source, here, there)
     modes = solution.modes.T_target_source
-    modes = back(modes, here[..., None, :], there[..., None, :])
+    modes = pose_back(modes, here[..., None, :], there[..., None, :])
     # Not by the constructor: JAX without x64 has no such arrays.
     return eqx.tree_at(
         lambda s: (s.T_target_source, s.modes.T_target_source), solution, (T, modes)
     )
+
+
+def pose_moved(T: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """As one between clouds moved to their origins, the source's and the target's."""
+    T = np.asarray(T, np.float64)
+    return _with_translation(T, T[..., :-1, -1] + _turned(T, here) - there)
+
+
+def pose_back(T: ArrayLike, here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """The other way; the rotation is made orthonormal to the last digit before."""
+    T = _orthonormal(np.asarray(T, np.float64))
+    return _with_translation(T, T[..., :-1, -1] + there - _turned(T, here))
 
 
 def _origins(source: Moved, target: Moved, d: int) -> tuple[np.ndarray, np.ndarray]:

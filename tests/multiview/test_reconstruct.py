@@ -398,3 +398,24 @@ def test_a_viewpoint_on_a_point_is_refused(sculpture):
     viewpoints = [None, sculpture[0][1][5], *6 * [None]]
     with pytest.raises(ValueError, match=r"viewpoints\[1\]: is a point.*row 5"):
         jr.reconstruct(sculpture[0], key=jax.random.key(0), viewpoints=viewpoints)
+
+
+def test_map_coordinates_keep_their_digits(sculpture):
+    scans, truth = sculpture
+    middles = np.array([5e5, 4.2e6, 120]) + 0.3 * np.arange(8)[:, None]
+    far = [s.astype(np.float64) + m for s, m in zip(scans, middles, strict=True)]
+    found = []
+    sol = jr.reconstruct(
+        far, key=jax.random.key(0), method=FILTER, on_pairs=found.append
+    )
+    assert np.all(sol.placed)
+    first = np.linalg.inv(truth[0])
+    for s, T, T_true, m in zip(far, sol.T_world_i, truth, middles, strict=True):
+        assert T.dtype == np.float64
+        wanted = move(first @ T_true, s - m) + middles[0]
+        assert np.max(np.linalg.norm(move(T, s) - wanted, axis=1)) < 0.005
+    # Pairs that were told lead to the same poses, to the last bit of float32.
+    told = RelativeMotions.joined(found)
+    again = jr.reconstruct(far, key=jax.random.key(0), method=FILTER, previous=told)
+    for s, T, T_again in zip(far, sol.T_world_i, again.T_world_i, strict=True):
+        assert np.max(np.linalg.norm(move(T, s) - move(T_again, s), axis=1)) < 1e-5

@@ -1,0 +1,113 @@
+"""Scans far from their origins, such as map coordinates: moved there and back."""
+
+import dataclasses
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxreg.multiview.positions import ScanPositions
+from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.solution import ReconstructionSolution
+from jaxreg.registration.far import near_origin, pose_back, pose_moved
+
+
+OnPairs = Callable[[RelativeMotions], None]
+
+
+class FarScans:
+    """Scans of which those that are far are moved to their middles.
+
+    Args:
+        scans, mask: as in `reconstruct`.
+
+    Attributes:
+        scans: near their origins.
+        moved: whether any are; else nothing is changed.
+        origin: `(v, d)` float64, what was subtracted from each.
+    """
+
+    def __init__(self, scans: object, mask: object) -> None:
+        self.scans, origin = near_origin(scans, mask, "scans")
+        self.moved = origin is not None
+        self.origin = np.zeros((0, 0)) if origin is None else origin
+
+    def viewpoints(self, viewpoints: object) -> object:
+        """In the moved frames."""
+        if viewpoints is None or not self.moved:
+            return viewpoints
+        if not isinstance(viewpoints, list | tuple):
+            return np.asarray(viewpoints, np.float64) - self.origin
+        pairs = zip(viewpoints, self.origin, strict=False)
+        return [None if x is None else np.asarray(x) - o for x, o in pairs]
+
+    def positions(self, positions: ScanPositions | None) -> ScanPositions | None:
+        """With antennas in the moved frames."""
+        if positions is None or not self.moved:
+            return positions
+        if positions.antenna is None:
+            raise ValueError(
+                "positions: scans far from their origins were taken from elsewhere: "
+                "wanted ScanPositions(..., antenna=...) in each scan's own frame."
+            )
+        antenna = np.asarray(positions.antenna, np.float64) - self.origin
+        return dataclasses.replace(positions, antenna=antenna)
+
+    def previous(self, previous: object) -> object:
+        """An earlier solution, or motions, between the moved frames."""
+        if not self.moved:
+            return previous
+        if isinstance(previous, RelativeMotions):
+            return self._motions(previous, pose_moved)
+        if not isinstance(previous, ReconstructionSolution):
+            return previous
+        if previous.num_scans > len(self.origin):  # refused later
+            return previous
+        return self._solution(previous, pose_moved)
+
+    def hears(self, on_pairs: OnPairs | None) -> OnPairs | None:
+        """Tells of motions between the frames of the input."""
+        if on_pairs is None or not self.moved:
+            return on_pairs
+        return lambda motions: on_pairs(self._motions(motions, pose_back))
+
+    def back(self, solution: ReconstructionSolution) -> ReconstructionSolution:
+        """Between the frames of the input, in float64 on the host."""
+        if not self.moved:
+            return solution
+        return self._solution(solution, pose_back)
+
+    def _motions(self, motions: RelativeMotions, change: Callable) -> RelativeMotions:
+        i, j = (self.origin[x] for x in np.asarray(motions.pairs).T)
+        T = change(np.asarray(motions.T_i_j), j[:, None], i[:, None])
+        out = eqx.tree_at(lambda m: m.T_i_j, motions, _told(T, change))
+        return jax.tree.map(jnp.asarray, out) if change is pose_moved else out
+
+    def _solution(
+        self, solution: ReconstructionSolution, change: Callable
+    ) -> ReconstructionSolution:
+        # The world of a component is the frame of its first scan.
+        component = np.asarray(solution.component)
+        first = np.argmax(component[:, None] == component, axis=1)
+        origin = self.origin[: len(component)]
+        T = change(np.asarray(solution.T_world_i), origin, origin[first])
+        alone = component < 0
+        T[alone] = np.eye(T.shape[-1])
+        i, j = (self.origin[x] for x in np.asarray(solution.graph.edges).T)
+        edges = change(np.asarray(solution.graph.T_i_j), j, i)
+        return eqx.tree_at(
+            lambda s: (s.T_world_i, s.graph.T_i_j, s.motions),
+            solution,
+            (
+                _told(T, change),
+                _told(edges, change),
+                self._motions(solution.motions, change),
+            ),
+        )
+
+
+def _told(T: np.ndarray, change: Callable) -> np.ndarray | jax.Array:
+    """For the search as JAX has it; for the user in float64."""
+    return jnp.asarray(T, jnp.result_type(float)) if change is pose_moved else T
