@@ -18,16 +18,15 @@ numbers of both ways are left,
     near    the share of the points beside that are within one spacing of the plane:
             surfaces that touch by chance part again.
 
-Over pairs of scans log gain and near are spread alike about two means, one of right
-poses and one of the best wrong ones; so the logarithm of the ratio of their densities
-is linear in them (Fisher's discriminant):
+The logarithm of the odds of a right pose against the best wrong one is taken to be
+linear in log gain and near (logistic regression on pairs of scans):
 
     log_evidence = _GAIN log gain + _NEAR near - _OFFSET
 
 at equal odds before. Nothing here is a length or a density of points, so lidar, RGB-D
-and scanned objects share the three numbers, and so do clouds that are thinned
-otherwise. How they were found, and what they say of data that they were not found on:
-bench/studies/evidence.md.
+and scanned objects share the three numbers. They were found on clouds thinned to 4,096
+points, and searches judge by as many; how, and what they say of data that they were not
+found on: bench/studies/evidence.md.
 """
 
 import math
@@ -55,7 +54,7 @@ from jaxreg.neighbours import AbstractIndex, BruteForce
 LIKELY = 1.0
 #: Of poses that are none: less than any pose has.
 NO_EVIDENCE = -100.0
-# The discriminant; `near` weighs like 25 independent places of which 95 % of those of
+# The regression; `near` weighs like 25 independent places of which 95 % of those of
 # a right pose are near and 80 % of those of a wrong one.
 _GAIN, _NEAR, _OFFSET = 2.3, 38.0, 34.8
 # Heights that are beside a surface, in local spacings.

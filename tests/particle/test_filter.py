@@ -262,6 +262,18 @@ def test_energies_that_tell_nothing_leave_uniform_weights(value):
         np.testing.assert_array_equal(solution.T_target_source, np.eye(3))
 
 
+def test_poses_are_judged_by_the_same_points_whatever_number_finds_them():
+    points, mask = jnp.asarray(blob(9000, 3)), jnp.ones(9000, bool)
+    usual = ParticleFilter().prepare(points, mask).with_spacing()
+    assert usual.judged is None
+    for num in (1024, 6000, 9000):
+        cloud = ParticleFilter(max_points=num).prepare(points, mask)
+        assert len(cloud.mask) == num
+        for name in ("points", "normals", "mask", "spacing"):
+            found = getattr(cloud.as_judged, name)
+            np.testing.assert_array_equal(found, getattr(usual, name))
+
+
 def test_given_particles_are_in_the_frames_of_the_input():
     # Far from the origin and in a small unit; one start is the truth.
     d = 2
