@@ -62,12 +62,15 @@ def _placed(
     T_world_i = jnp.where(placed[:, None, None], T_world_i, eye)
     reached = jnp.all(placed if present is None else placed | ~present)
     status = jnp.where(reached, out.status, Status.DISCONNECTED)
-    finite = gauge.finite & jnp.all(sound)
+    # Squares of lengths may overflow though the lengths do not.
+    told = jnp.isfinite(out.edge_weight)
+    edge_weight = jnp.where(told, out.edge_weight, 0)
+    finite = gauge.finite & jnp.all(sound) & jnp.all(told)
     status = jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)
     return eqx.tree_at(
-        lambda s: (s.T_world_i, s.placed, s.component, s.status),
+        lambda s: (s.T_world_i, s.edge_weight, s.placed, s.component, s.status),
         out,
-        (T_world_i, placed, gauge.component, status),
+        (T_world_i, edge_weight, placed, gauge.component, status),
     )
 
 

@@ -325,6 +325,18 @@ def test_numbers_that_are_not_finite_cost_their_edge_alone():
     np.testing.assert_allclose(solution.T_world_i, X, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_lengths_whose_squares_overflow_are_believed_of_nobody_who_is_wrong(name):
+    X, edges, T, _ = random_graph(N, H, 0.0, 6, noise=0.0)
+    T = T.copy()
+    T[:, :3, 3] *= 1e30
+    solution = average(single(X, edges, T), METHODS[name])
+    assert np.all(np.isfinite(solution.edge_weight))
+    assert np.all(np.isfinite(solution.T_world_i))
+    turn = np.asarray(rotation_error(solution.T_world_i, X.astype(np.float32)))
+    assert turn.max() < 0.01 or solution.status != Status.CONVERGED
+
+
 def test_of_contradicting_measurements_of_a_pair_the_right_one_is_trusted():
     X, edges, T, _ = random_graph(N, H, 0.0, 8)
     wild = random_graph(N, H, 0.0, 9)[2]
