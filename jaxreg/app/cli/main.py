@@ -1,7 +1,7 @@
 """Entry point of the command `jaxreg`: parses, dispatches, and speaks of errors.
 
-Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted, 141
-when nobody reads the output any more.
+Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted, 143
+ended by SIGTERM, 129 by SIGHUP, 141 when nobody reads the output any more.
 """
 
 import _thread
@@ -27,8 +27,19 @@ _INTERRUPTED, _UNREAD = 130, 141
 def command() -> NoReturn:
     """The process `jaxreg`: runs the command of its arguments and ends."""
     sys.unraisablehook = _heard_again
+    ended: list[int] = []
+
+    def end(number: int, _: object) -> None:
+        ended.append(number)
+        raise KeyboardInterrupt
+
+    for name in ("SIGTERM", "SIGHUP"):  # nohup has the latter ignored
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, end)
     code = main()
     if code == _INTERRUPTED:
+        code = 128 + ended[0] if ended else code
         # Threads may still compute, and crash as Python takes down what they use.
         sys.stdout.flush()
         sys.stderr.flush()

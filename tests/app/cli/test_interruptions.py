@@ -1,6 +1,7 @@
 """Runs that end early lose nothing that is finished, and leave nothing half done."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -65,6 +66,28 @@ main.command()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 130
+    assert done.stderr == "jaxreg: interrupted; no results were written.\n"
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="POSIX alone has it")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_run_that_is_ended_says_so_and_leaves_nothing(folder: Path, number: int):
+    code = """
+import os, signal, sys, time
+from jaxreg.app.cli import main
+
+signal.signal(int(sys.argv[1]), signal.SIG_DFL)  # nohup has one ignored
+
+def run(_):
+    os.kill(os.getpid(), int(sys.argv[1]))
+    time.sleep(30)
+
+main._run = run
+main.command()
+"""
+    command = [sys.executable, "-c", code, str(int(number))]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 128 + number
     assert done.stderr == "jaxreg: interrupted; no results were written.\n"
 
 
