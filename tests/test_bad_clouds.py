@@ -93,5 +93,7 @@ def test_a_guess_that_is_not_rigid_is_refused(scale):
     bent = T @ np.diag([*scale, 1])
     with pytest.raises(ValueError, match="init: wanted rigid motions"):
         jr.register(source, target, jr.ICP(), init=bent)
+    if min(scale) > 0:  # where it is looked for, scale may be given
+        jr.register(source, target, jr.ICP(with_scale=True), init=bent)
     with pytest.raises(ValueError, match="init: wanted rigid motions"):
         jr.register([source], [target], jr.ICP(), init=bent[None])

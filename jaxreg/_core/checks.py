@@ -116,10 +116,10 @@ def check_motion(T: Array, d: int, name: str) -> None:
         )
 
 
-def check_rigid(T: Array, name: str) -> None:
-    """Requires rotations without scale or reflection; traced ones are not looked at.
+def check_rigid(T: Array, name: str, scaled: bool = False) -> None:
+    """Requires rotations without reflection, and without scale if not `scaled`.
 
-    Nor are those that are not finite: they end in a status.
+    Traced ones are not looked at, nor those that are not finite: they end in a status.
     """
     if not is_concrete(T):
         return
@@ -127,6 +127,9 @@ def check_rigid(T: Array, name: str) -> None:
     R = R.reshape(-1, *R.shape[-2:])
     R = R[np.all(np.isfinite(R), axis=(1, 2))]
     gram = np.einsum("bij,bik->bjk", R, R)
+    if scaled:
+        size = np.trace(gram, axis1=1, axis2=2) / R.shape[-1]
+        gram = gram / np.maximum(size, np.finfo(size.dtype).tiny)[:, None, None]
     worst = np.max(np.abs(gram - np.eye(R.shape[-1])), initial=0)
     if worst > ROTATION_TOLERANCE or np.any(np.linalg.det(R) < 0):
         raise ValueError(

@@ -19,6 +19,8 @@ from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
 
 # A cloud so many radii from the origin loses two of the seven digits of float32.
 _FAR = 100.0
+# Rotations of float32 are orthonormal within this.
+_ROUNDING = 1e-5
 
 
 class Moved(NamedTuple):
@@ -145,8 +147,13 @@ def _with_translation(T: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def _orthonormal(T: np.ndarray) -> np.ndarray:
-    """To the last digit: seven of a rotation are a metre at a million metres."""
-    U, _, Vt = np.linalg.svd(T[..., :-1, :-1])
+    """To the last digit: seven of a rotation are a metre at a million metres.
+
+    A scale that was looked for stays.
+    """
+    U, size, Vt = np.linalg.svd(T[..., :-1, :-1])
+    scale = np.mean(size, axis=-1)
+    scale = np.where(np.abs(scale - 1) < _ROUNDING, 1, scale)
     out = T.copy()
-    out[..., :-1, :-1] = U @ Vt
+    out[..., :-1, :-1] = scale[..., None, None] * (U @ Vt)
     return out

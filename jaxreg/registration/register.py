@@ -25,6 +25,7 @@ from jaxreg.batching.padding import (
     rounded_up,
     stacked,
 )
+from jaxreg.local import ICP
 from jaxreg.particle import ParticleFilter
 from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
 from jaxreg.registration.far import (
@@ -151,6 +152,7 @@ def register(
     check_count(batch_size, "batch_size")
     key = None if key is None else check_key(key)
     masks = source_mask, target_mask
+    scaled = isinstance(method, ICP) and method.with_scale
     here = near_origin(source, source_mask, "source")
     there = near_origin(target, target_mask, "target")
     check_prior_fits(method, here, there)
@@ -158,12 +160,12 @@ def register(
     if is_list_of_clouds(source) or is_list_of_clouds(target):
         lists = check_lists(here.points, there.points, *masks)
         batch = (len(lists[0]),)
-        init = _check_init(init, batch, lists[0][0])
+        init = _check_init(init, batch, lists[0][0], scaled)
         found = register_lists(method, lists, init, key, batch_size, progress)
         return [moved_back(sol, here.at(i), there.at(i)) for i, sol in enumerate(found)]
     pair = check_pair(here.points, there.points, *masks)
     batch = pair[0].shape[:-2]
-    init = _check_init(init, batch, pair[0])
+    init = _check_init(init, batch, pair[0], scaled)
     if batch:
         sol = register_batch(method, batch, pair, init, key, batch_size, progress)
     else:
@@ -172,14 +174,14 @@ def register(
 
 
 def _check_init(
-    init: object, batch: tuple[int, ...], points: Array
+    init: object, batch: tuple[int, ...], points: Array, scaled: bool
 ) -> Float[Array, "*b D D"] | None:
     """Initial poses with the leading axes `batch`."""
     if init is None:
         return None
     found, d = as_float_array(init, "init").astype(points.dtype), points.shape[-1]
     check_motion(found, d, "init")
-    check_rigid(found, "init")
+    check_rigid(found, "init", scaled)
     try:
         return jnp.broadcast_to(found, (*batch, d + 1, d + 1))
     except ValueError as err:

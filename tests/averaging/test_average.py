@@ -333,7 +333,7 @@ def test_lengths_whose_squares_overflow_are_believed_of_nobody_who_is_wrong(name
     solution = average(single(X, edges, T), METHODS[name])
     assert np.all(np.isfinite(solution.edge_weight))
     assert np.all(np.isfinite(solution.T_world_i))
-    turn = np.asarray(rotation_error(solution.T_world_i, X.astype(np.float32)))
+    turn = np.asarray(rotation_error(solution.T_world_i, jnp.asarray(X, np.float32)))
     assert turn.max() < 0.01 or solution.status != Status.CONVERGED
 
 
