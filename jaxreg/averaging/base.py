@@ -1,6 +1,7 @@
 """The contract of every averaging method, and its solution."""
 
 import abc
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from jaxreg._core.typing import Key, StatusArray
 from jaxreg.averaging.likelihood import log_evidence, nothing_agrees
 from jaxreg.averaging.measures import frobenius, length_scale, weighted_mean
 from jaxreg.averaging.trace import AveragingTrace
+from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 
 
@@ -59,6 +61,17 @@ class AveragingSolution(eqx.Module):
     log_evidence: Float[Array, ""]
     length_scale: Float[Array, ""]
     trace: AveragingTrace | None = None
+
+    def in_unit(self, length: Float[Array, ""]) -> "AveragingSolution":
+        """In another unit of length, which is `1 / length`."""
+        T, width = self.T_world_i, self.kernel_width
+        return dataclasses.replace(
+            self,
+            T_world_i=lie.compose(lie.rotation(T), lie.translation(T) * length),
+            kernel_width=width * jnp.stack([length, jnp.ones_like(length)]),
+            length_scale=self.length_scale * length,
+            trace=None if self.trace is None else self.trace.in_unit(length),
+        )
 
     def __repr__(self) -> str:
         if not is_concrete(self.status) or self.status.ndim:

@@ -10,6 +10,7 @@ from jaxreg._core.arrays import cast_floats
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
+from jaxreg.averaging.unit import in_range
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
@@ -29,6 +30,7 @@ def average_graph(
 
 class _Gauge(NamedTuple):
     T_world_0: Array
+    unit: Array
     component: Array
     finite: Array
 
@@ -41,20 +43,23 @@ def _prepared(
     dtype, d = graph.T_i_j.dtype, graph.dim
     method = cast_floats(method, dtype)
     reduced, component, finite = _reduce(graph)
+    reduced, unit = in_range(reduced)
     T_start, T_world_0 = None, jnp.eye(d + 1, dtype=dtype)
     if init is not None:
         sound = jnp.all(jnp.isfinite(init), axis=(1, 2))
         finite = finite & jnp.all(sound)
         init = jnp.where(sound[:, None, None], init, jnp.eye(d + 1, dtype=dtype))
         T_world_0 = init[0]
-        T_start = lie.inverse(T_world_0) @ init
-    return reduced, method, T_start, _Gauge(T_world_0, component, finite)
+        T_0_i = lie.inverse(T_world_0) @ init
+        T_start = lie.compose(lie.rotation(T_0_i), lie.translation(T_0_i) / unit)
+    return reduced, method, T_start, _Gauge(T_world_0, unit, component, finite)
 
 
 @eqx.filter_jit
 def _placed(
     out: AveragingSolution, gauge: _Gauge, present: Bool[Array, " v"] | None
 ) -> AveragingSolution:
+    out = out.in_unit(gauge.unit)
     T_0_i, placed = out.T_world_i, gauge.component == gauge.component[0]
     eye = jnp.eye(T_0_i.shape[-1], dtype=T_0_i.dtype)
     sound = jnp.all(jnp.isfinite(T_0_i), axis=(1, 2))
@@ -62,7 +67,7 @@ def _placed(
     T_world_i = jnp.where(placed[:, None, None], T_world_i, eye)
     reached = jnp.all(placed if present is None else placed | ~present)
     status = jnp.where(reached, out.status, Status.DISCONNECTED)
-    # Squares of lengths may overflow though the lengths do not.
+    # Squares of one length may overflow beside those of the others.
     told = jnp.isfinite(out.edge_weight)
     edge_weight = jnp.where(told, out.edge_weight, 0)
     finite = gauge.finite & jnp.all(sound) & jnp.all(told)

@@ -326,15 +326,29 @@ def test_numbers_that_are_not_finite_cost_their_edge_alone():
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_lengths_whose_squares_overflow_are_believed_of_nobody_who_is_wrong(name):
+@pytest.mark.parametrize(("length", "weight"), [(1e30, 1e38), (1e-30, 1e-37)])
+def test_lengths_and_weights_may_be_of_any_size(name, length, weight):
     X, edges, T, _ = random_graph(N, H, 0.0, 6, noise=0.0)
+    usual = average(single(X, edges, T), METHODS[name])
     T = T.copy()
-    T[:, :3, 3] *= 1e30
-    solution = average(single(X, edges, T), METHODS[name])
-    assert np.all(np.isfinite(solution.edge_weight))
-    assert np.all(np.isfinite(solution.T_world_i))
-    turn = np.asarray(rotation_error(solution.T_world_i, jnp.asarray(X, np.float32)))
-    assert turn.max() < 0.01 or solution.status != Status.CONVERGED
+    T[:, :3, 3] *= length
+    found = average(single(X, edges, T, np.full(len(T), weight)), METHODS[name])
+    assert found.status == usual.status
+    assert np.max(rotation_error(found.T_world_i, usual.T_world_i)) < 0.01
+    shift = found.T_world_i[:, :3, 3] / length - usual.T_world_i[:, :3, 3]
+    assert np.max(np.abs(shift)) < 0.01 * np.max(np.abs(usual.T_world_i[:, :3, 3]))
+    ratio = found.kernel_width[0] / usual.kernel_width[0]
+    assert np.isinf(usual.kernel_width[0]) or abs(ratio / length - 1) < 0.5
+    np.testing.assert_allclose(found.edge_weight, usual.edge_weight, atol=0.05)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_weight_that_vanishes_beside_the_others_still_joins(name):
+    X, edges, T, _ = random_graph(N, H, 0.0, 6, noise=0.0)
+    weight = np.where(np.arange(len(T)) % 2, 1e38, 1e-37)
+    found = average(single(X, edges, T, weight), METHODS[name])
+    assert found.placed.all()
+    assert errors(found, X)[0] < 0.01
 
 
 def test_of_contradicting_measurements_of_a_pair_the_right_one_is_trusted():
