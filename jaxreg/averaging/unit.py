@@ -41,7 +41,7 @@ def in_range(graph: PoseGraph) -> tuple[PoseGraph, Float[Array, ""]]:
 
 
 def _factor(size: Float[Array, ""]) -> Float[Array, ""]:
-    """One where `size` is 0 or has a sound fourth power, else a power of two near it."""
+    """One where `size` is 0 or has a sound fourth power, else a power of two by it."""
     info = jnp.finfo(size.dtype)
     sound = (size >= info.tiny**0.25) & (size <= info.max**0.25)
     power = jnp.floor(jnp.log2(jnp.where(size > 0, size, 1))).astype(jnp.int32)
