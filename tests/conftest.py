@@ -1,3 +1,4 @@
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,12 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 os.environ.setdefault("MPLBACKEND", "agg")
 
 
+def pytest_collection_finish() -> None:
+    """Tracing makes much garbage: looking through all that lives costs a fifth."""
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 50)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _bounded_number_of_live_programs() -> Iterator[None]:
     """A process that holds hundreds of compiled programs can die on CPU."""
@@ -21,6 +28,8 @@ def _bounded_number_of_live_programs() -> Iterator[None]:
     import jax
 
     jax.clear_caches()
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="module")
