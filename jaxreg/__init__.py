@@ -50,69 +50,11 @@ Static and traced:
     Numbers (tolerances, widths, scales) are traced, changing one does not.
 """
 
-from jaxreg import io as io
-from jaxreg import metrics as metrics
-from jaxreg import neighbours as neighbours
-from jaxreg import particle as particle
-from jaxreg import robust as robust
-from jaxreg._core.adjoint import ImplicitAdjoint as ImplicitAdjoint
-from jaxreg._core.adjoint import (
-    RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint,
-)
-from jaxreg._core.status import Status as Status
-from jaxreg.averaging import MCC as MCC
-from jaxreg.averaging import AbstractAverager as AbstractAverager
-from jaxreg.averaging import AveragingSolution as AveragingSolution
-from jaxreg.averaging import AveragingTrace as AveragingTrace
-from jaxreg.averaging import ChordalError as ChordalError
-from jaxreg.averaging import Correntropy as Correntropy
-from jaxreg.averaging import LogError as LogError
-from jaxreg.averaging import LowRankSparse as LowRankSparse
-from jaxreg.averaging import MotionAveraging as MotionAveraging
-from jaxreg.averaging import PoseGraphLM as PoseGraphLM
-from jaxreg.averaging import RootRows as RootRows
-from jaxreg.averaging import ShortestPaths as ShortestPaths
-from jaxreg.averaging import SpanningTree as SpanningTree
-from jaxreg.averaging import WeightedMotionAveraging as WeightedMotionAveraging
-from jaxreg.averaging import WeightRows as WeightRows
-from jaxreg.averaging import average as average
-from jaxreg.averaging import pose_covariances as pose_covariances
-from jaxreg.correlation import KernelCorrelation as KernelCorrelation
-from jaxreg.graph import PoseGraph as PoseGraph
-from jaxreg.local import ICP as ICP
-from jaxreg.local import AbstractStep as AbstractStep
-from jaxreg.local import ClosedForm as ClosedForm
-from jaxreg.local import GaussNewton as GaussNewton
-from jaxreg.local import GradientDescent as GradientDescent
-from jaxreg.local import LevenbergMarquardt as LevenbergMarquardt
-from jaxreg.matching import AbstractResidual as AbstractResidual
-from jaxreg.matching import PlaneToPlane as PlaneToPlane
-from jaxreg.matching import PointToPlane as PointToPlane
-from jaxreg.matching import PointToPoint as PointToPoint
-from jaxreg.matching import Symmetric as Symmetric
-from jaxreg.multiview import ReconstructionSolution as ReconstructionSolution
-from jaxreg.multiview import RelativeMotions as RelativeMotions
-from jaxreg.multiview import ScanPositions as ScanPositions
-from jaxreg.multiview import reconstruct as reconstruct
-from jaxreg.neighbours import AbstractIndex as AbstractIndex
-from jaxreg.neighbours import BoxTree as BoxTree
-from jaxreg.neighbours import BruteForce as BruteForce
-from jaxreg.neighbours import CellGrid as CellGrid
-from jaxreg.neighbours import VoxelTable as VoxelTable
-from jaxreg.neighbours import correspondences as correspondences
-from jaxreg.particle import AbstractDynamics as AbstractDynamics
-from jaxreg.particle import AbstractEnergy as AbstractEnergy
-from jaxreg.particle import AbstractPrior as AbstractPrior
-from jaxreg.particle import AbstractResampler as AbstractResampler
-from jaxreg.particle import MultiStart as MultiStart
-from jaxreg.particle import PartialPose as PartialPose
-from jaxreg.particle import ParticleFilter as ParticleFilter
-from jaxreg.particle import sandhu2010 as sandhu2010
-from jaxreg.registrar import AbstractRegistrar as AbstractRegistrar
-from jaxreg.registrar import RegistrationSolution as RegistrationSolution
-from jaxreg.registrar import SearchTrace as SearchTrace
-from jaxreg.registration import register as register
-from jaxreg.robust import AbstractKernel as AbstractKernel
+import lazy_loader
 
+
+# Names are in the stub beside this file, and imported when they are first used: who
+# asks for help, a version, or what a file holds, need not wait for JAX.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = "0.1.0"

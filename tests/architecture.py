@@ -57,12 +57,17 @@ def room_of(module: str) -> str | None:
 
 
 def imported(path: Path) -> set[str]:
-    """Modules of the package that a file imports, the package itself as `__init__`."""
-    found = set()
+    """Modules of the package that a file imports, the package itself as `__init__`.
+
+    A stub names what is imported at its first use, by relative imports.
+    """
+    found, stub = set(), path.suffix == ".pyi"
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            assert node.level == stub, f"{path}: relative import"
+            home = [*path.parent.relative_to(PACKAGE.parent).parts] if stub else []
+            module = ".".join([*home, *([node.module] if node.module else [])])
+            names = [f"{module}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         else:
@@ -78,7 +83,9 @@ def imported(path: Path) -> set[str]:
 def arrows() -> dict[tuple[str, str], list[str]]:
     """The files that make each arrow between two rooms."""
     found: dict[tuple[str, str], list[str]] = {}
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in sorted(PACKAGE.rglob("*.py*")):
+        if path.suffix not in (".py", ".pyi"):
+            continue
         source = room_of(module_of(path))
         for module in imported(path):
             # Only names of the package's own `__init__` belong to no room below it.

@@ -87,7 +87,7 @@ def test_contracts_are_few_methods_and_stand_at_the_top():
     for cls in CLASSES:
         abstract = [name for name in _methods(cls) if _is_promised(cls, name)]
         assert len(abstract) <= 5, f"{cls.__name__}: {abstract}"
-    assert set(vars(jr)) >= {
+    assert set(jr.__all__) >= {
         "AbstractAverager",
         "AbstractDynamics",
         "AbstractEnergy",
@@ -99,5 +99,5 @@ def test_contracts_are_few_methods_and_stand_at_the_top():
         "AbstractResidual",
         "AbstractStep",
     }
-    public = [n for n in vars(jr) if not n.startswith("_")]
-    assert len([n for n in public if not inspect.ismodule(vars(jr)[n])]) <= MOST_NAMES
+    public = [getattr(jr, name) for name in jr.__all__]
+    assert len([x for x in public if not inspect.ismodule(x)]) <= MOST_NAMES

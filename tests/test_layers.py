@@ -31,11 +31,27 @@ def test_linear_algebra_knows_arrays_alone():
 
 def test_what_solves_loads_nothing_that_draws_or_parses():
     heavy = "{'matplotlib', 'plotly', 'rich', 'tyro', 'jaxreg.app'}"
-    code = f"import sys, jaxreg; sys.exit(str(set(sys.modules) & {heavy} or ''))"
+    code = (
+        "import sys; from jaxreg import *; from jaxreg.io import *; "
+        f"sys.exit(str(set(sys.modules) & {heavy} or ''))"
+    )
+    assert _said(code) == ""
+
+
+def test_names_are_imported_when_they_are_used():
+    heavy = "{'jax', 'numpy', 'scipy', 'equinox'}"
+    code = (
+        "import sys, jaxreg, jaxreg.io; "
+        f"sys.exit(str(set(sys.modules) & {heavy} or ''))"
+    )
+    assert _said(code) == ""
+
+
+def _said(code: str) -> str:
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent
     )
-    assert done.stderr.strip() == ""
+    return done.stderr.strip()
 
 
 def test_jaxlie_lives_behind_one_module():

@@ -82,7 +82,7 @@ def test_every_public_method_is_in_the_table():
     assert _concrete(jr.AbstractDynamics) == _types(DYNAMICS)
     assert _concrete(jr.AbstractEnergy) == _types(ENERGIES)
     assert _concrete(jr.AbstractPrior) == _types(prior for prior, _ in PRIORS)
-    public = {name: x for name, x in vars(jr).items() if not name.startswith("_")}
+    public = {name: getattr(jr, name) for name in jr.__all__}
     functions = {
         name for name, x in public.items() if callable(x) and not inspect.isclass(x)
     }

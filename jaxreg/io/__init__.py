@@ -1,29 +1,8 @@
 """Reading and writing scans, poses and graphs."""
 
-from jaxreg.io.atomic import atomic_folder as atomic_folder
-from jaxreg.io.atomic import atomic_write as atomic_write
-from jaxreg.io.atomic import require_writable as require_writable
-from jaxreg.io.errors import InputError as InputError
-from jaxreg.io.errors import MissingExtraError as MissingExtraError
-from jaxreg.io.graphs.g2o import read_g2o as read_g2o
-from jaxreg.io.graphs.g2o import read_g2o_poses as read_g2o_poses
-from jaxreg.io.graphs.g2o import write_g2o as write_g2o
-from jaxreg.io.graphs.redwood import read_info as read_info
-from jaxreg.io.graphs.redwood import read_log as read_log
-from jaxreg.io.graphs.redwood import write_log as write_log
-from jaxreg.io.graphs.toro import read_toro as read_toro
-from jaxreg.io.interop import from_gtsam as from_gtsam
-from jaxreg.io.interop import from_open3d_graph as from_open3d_graph
-from jaxreg.io.interop import points_of as points_of
-from jaxreg.io.interop import to_gtsam as to_gtsam
-from jaxreg.io.interop import to_open3d as to_open3d
-from jaxreg.io.interop import to_open3d_graph as to_open3d_graph
-from jaxreg.io.interop import to_trimesh as to_trimesh
-from jaxreg.io.points.ply import write_ply as write_ply
-from jaxreg.io.points.read import read_points as read_points
-from jaxreg.io.points.read import read_scans as read_scans
-from jaxreg.io.poses.kitti import read_kitti as read_kitti
-from jaxreg.io.poses.kitti import write_kitti as write_kitti
-from jaxreg.io.poses.stanford import read_conf as read_conf
-from jaxreg.io.poses.tum import read_tum as read_tum
-from jaxreg.io.poses.tum import write_tum as write_tum
+import lazy_loader
+
+
+# Names are in the stub beside this file, and imported when they are first used: who
+# asks for help, a version, or what a file holds, need not wait for JAX.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
