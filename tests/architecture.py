@@ -33,7 +33,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("io",),
     ("__init__",),
     ("testing",),
-    ("app.colors", "app.describe", "app.folder", "app.pair_log"),
+    ("app.colors", "app.describe", "app.folder", "app.pair_log", "app.versions"),
     ("app.result",),
     ("app.plot",),
     ("app.views",),

@@ -1,4 +1,7 @@
-"""What a file of points or poses holds: counts, extent, spacing, a word on units."""
+"""What a file of points or poses holds: counts, extent, spacing, a word on units.
+
+Libraries are imported where they are used: a scan needs no JAX, a graph no k-d tree.
+"""
 
 import collections
 import warnings
@@ -8,11 +11,8 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from jaxreg.io.files import text_lines
-from jaxreg.io.graphs import g2o
-from jaxreg.io.graphs.toro import read_toro
 from jaxreg.io.points.read import NamedPoints, read_named
 
 
@@ -147,6 +147,8 @@ def _spacing(points: np.ndarray, parts: int = 5, size: int = 40_000) -> float | 
 
     The queries lie in the middle of a slice, so that their neighbours lie in it too.
     """
+    from scipy.spatial import KDTree
+
     if len(points) < 2:
         return None
     order = np.argsort(points[:, np.argmax(np.ptp(points, axis=0))])
@@ -188,6 +190,9 @@ def _hint(low: np.ndarray, high: np.ndarray, spacing: float, dtype: np.dtype) ->
 
 
 def _graph(path: Path) -> GraphFacts:
+    from jaxreg.io.graphs import g2o
+    from jaxreg.io.graphs.toro import read_toro
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it counts the lines that are counted below
         if path.suffix == ".graph":

@@ -6,11 +6,9 @@ in the frames and unit of the files that were read.
 
 import json
 import math
-import platform
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,7 @@ import numpy as np
 
 from jaxreg._core.status import Status
 from jaxreg.app.colors import scan_colors
+from jaxreg.app.versions import versions
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.graphs.g2o import write_g2o
@@ -209,26 +208,6 @@ def merge_scans(
         points, owners = points[keep], owners[keep]
     narrow = all(s.dtype == np.float32 for s in scans)
     return points.astype(np.float32 if narrow else np.float64), owners
-
-
-def version(package: str) -> str:
-    """The version of an installed package; a bare source tree has none."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
-def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on, and the device."""
-    found = {name: version(name) for name in ("jaxreg", "jax", "jaxlib", "numpy")}
-    device = jax.devices()[0]
-    return {
-        **found,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "device": f"{device.platform} {device.device_kind}",
-    }
 
 
 def _scan_entry(result: Result, i: int) -> dict[str, Any]:

@@ -1,21 +1,20 @@
 """`jaxreg average`: poses from the relative motions of a g2o file."""
 
 import warnings
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
-import tyro
 from rich.table import Table
 
 from jaxreg._core.status import Status
 from jaxreg.app.cli import outputs
-from jaxreg.app.cli.runtime import Options, Precision, Session
+from jaxreg.app.cli.options import Average
+from jaxreg.app.cli.runtime import Session, key_of
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_graph, save_figure, write_graph_report
-from jaxreg.app.result import versions, write_json
+from jaxreg.app.result import write_json
+from jaxreg.app.versions import versions
 from jaxreg.averaging import (
     AveragingSolution,
     Correntropy,
@@ -39,104 +38,84 @@ METHODS = {
 FILES = ("result.json", "poses.tum", "graph.g2o", "figure.png", "report.html")
 
 
-@dataclass(frozen=True)
-class Average(Options):
-    """Find poses that agree with the relative motions of a pose graph."""
+def run(command: Average, session: Session) -> int:
+    """Runs the command; returns the exit code."""
+    if command.budget is not None and command.budget < 1:
+        raise InputError(f"--budget {command.budget}: wanted at least 1 step.")
+    steps = {} if command.budget is None else {"max_steps": command.budget}
+    method = METHODS[command.method](**steps)
+    with session.timed("read"), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        graph = read_g2o(command.graph)
+        ids, _ = read_g2o_poses(command.graph)
+    for message in {str(w.message) for w in caught}:
+        session.console.print(message)
+    key = key_of(command)
+    with session.progress() as progress, session.timed("run", computes=True):
+        progress("averaging", 0, 2)
+        before = average(graph, method=ShortestPaths())
+        progress("averaging", 1, 2)
+        sol = average(graph, method=method, key=key)
+        jax.block_until_ready(sol)
+        progress("averaging", 2, 2)
+    objective = [float(chordal_objective(graph, s.T_world_i)) for s in (before, sol)]
+    _write(session, graph, before, sol, ids, objective)
+    _show(session, graph, sol, objective)
+    outputs.show_end(session, FILES, command.out)
+    return 0
 
-    graph: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GRAPH.g2o")]
-    """A g2o file; its vertices are not used, the answer comes from its edges alone."""
-    method: Literal["correntropy", "plain", "weighted"] = "correntropy"
-    """Correntropy bears wrong edges; plain and weighted are for graphs without any."""
-    precision: Precision = field(default="float64", kw_only=True)
-    """Of the computation; graphs of thousands of poses need the digits."""
-    budget: Annotated[
-        int | None,
-        tyro.conf.arg(
-            metavar="INT", help_behavior_hint="(default: 100; plain, weighted: 50)"
-        ),
-    ] = None
-    """Steps of the method, at most."""
 
-    def run(self, session: Session) -> int:
-        """Runs the command; returns the exit code."""
-        if self.budget is not None and self.budget < 1:
-            raise InputError(f"--budget {self.budget}: wanted at least 1 step.")
-        steps = {} if self.budget is None else {"max_steps": self.budget}
-        method = METHODS[self.method](**steps)
-        with session.timed("read"), warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            graph = read_g2o(self.graph)
-            ids, _ = read_g2o_poses(self.graph)
-        for message in {str(w.message) for w in caught}:
-            session.console.print(message)
-        key = self.key()
-        with session.progress() as progress, session.timed("run", computes=True):
-            progress("averaging", 0, 2)
-            before = average(graph, method=ShortestPaths())
-            progress("averaging", 1, 2)
-            sol = average(graph, method=method, key=key)
-            jax.block_until_ready(sol)
-            progress("averaging", 2, 2)
-        objective = [
-            float(chordal_objective(graph, s.T_world_i)) for s in (before, sol)
+def _write(
+    session: Session,
+    graph: PoseGraph,
+    before: AveragingSolution,
+    sol: AveragingSolution,
+    ids: np.ndarray,
+    objective: list[float],
+) -> None:
+    with result_folder(session.options.out) as staging:
+        with session.timed("write"):
+            figure = draw_graph(
+                np.asarray(graph.edges),
+                np.asarray(before.T_world_i),
+                np.asarray(sol.T_world_i),
+                np.asarray(sol.placed),
+            )
+            save_figure(staging / "figure.png", figure)
+            write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids)
+            placed = np.asarray(sol.placed)
+            write_tum(
+                staging / "poses.tum",
+                np.asarray(sol.T_world_i)[placed],
+                timestamps=ids[placed],
+            )
+        document = _document(sol, ids, objective)
+        document["edges"] = [
+            {"i": int(ids[i]), "j": int(ids[j]), "weight": float(w)}
+            for (i, j), w in zip(
+                np.asarray(graph.edges).tolist(),
+                np.asarray(sol.edge_weight),
+                strict=True,
+            )
         ]
-        self._write(session, graph, before, sol, ids, objective)
-        _show(session, graph, sol, objective)
-        outputs.show_end(session, FILES, self.out)
-        return 0
-
-    def _write(
-        self,
-        session: Session,
-        graph: PoseGraph,
-        before: AveragingSolution,
-        sol: AveragingSolution,
-        ids: np.ndarray,
-        objective: list[float],
-    ) -> None:
-        with result_folder(self.out) as staging:
-            with session.timed("write"):
-                figure = draw_graph(
-                    np.asarray(graph.edges),
-                    np.asarray(before.T_world_i),
-                    np.asarray(sol.T_world_i),
-                    np.asarray(sol.placed),
-                )
-                save_figure(staging / "figure.png", figure)
-                write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids)
-                placed = np.asarray(sol.placed)
-                write_tum(
-                    staging / "poses.tum",
-                    np.asarray(sol.T_world_i)[placed],
-                    timestamps=ids[placed],
-                )
-            document = _document(sol, ids, objective)
-            document["edges"] = [
-                {"i": int(ids[i]), "j": int(ids[j]), "weight": float(w)}
-                for (i, j), w in zip(
-                    np.asarray(graph.edges).tolist(),
-                    np.asarray(sol.edge_weight),
-                    strict=True,
-                )
-            ]
-            document |= {
-                "command": session.command,
-                "seed": session.options.seed,
-                "times_s": {k: round(v, 3) for k, v in session.times.items()},
-                "versions": versions(),
-                "files": list(FILES),
-            }
-            write_json(staging / "result.json", document)
-            with outputs.page_or_message(session):
-                write_graph_report(
-                    staging / "report.html",
-                    graph,
-                    sol,
-                    before,
-                    ids.tolist(),
-                    details=outputs.page_details(session, document)
-                    | {k: document[k] for k in ("objective_before", "objective_after")},
-                )
+        document |= {
+            "command": session.command,
+            "seed": session.options.seed,
+            "times_s": {k: round(v, 3) for k, v in session.times.items()},
+            "versions": versions(),
+            "files": list(FILES),
+        }
+        write_json(staging / "result.json", document)
+        with outputs.page_or_message(session):
+            write_graph_report(
+                staging / "report.html",
+                graph,
+                sol,
+                before,
+                ids.tolist(),
+                details=outputs.page_details(session, document)
+                | {k: document[k] for k in ("objective_before", "objective_after")},
+            )
 
 
 def _document(

@@ -3,52 +3,39 @@
 import json
 import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
-
+from jaxreg.app.cli.options import Info
 from jaxreg.app.describe import GRAPHS, GraphFacts, ScanFacts, describe, unit_notes
 from jaxreg.io.errors import InputError
 from jaxreg.io.points.read import point_files, prose_files
 
 
-@dataclass(frozen=True)
-class Info:
-    """Tell what files of scans or pose graphs hold."""
-
-    files: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]],
-        tyro.conf.arg(metavar="FILE ...", help_behavior_hint="(required)"),
+def run(command: Info) -> int:
+    """Runs the command; returns the exit code."""
+    if not command.files:
+        raise InputError("No files given.\nUsage: jaxreg info FILE ...")
+    # All are read before a word is said: a wrong one leaves no half of an answer.
+    found = [(file, describe(file)) for f in command.files for file in _expand(f)]
+    scans = [
+        (str(file) if len(facts) == 1 else f"{file}:{scan.name}", scan)
+        for file, facts in found
+        if not isinstance(facts, GraphFacts)
+        for scan in facts
     ]
-    """Scans, archives of scans, folders of these, pose graphs (g2o, TORO .graph)."""
-    json: bool = False
-    """Print one JSON object instead."""
-
-    def run(self) -> int:
-        """Runs the command; returns the exit code."""
-        if not self.files:
-            raise InputError("No files given.\nUsage: jaxreg info FILE ...")
-        # All are read before a word is said: a wrong one leaves no half of an answer.
-        found = [(file, describe(file)) for f in self.files for file in _expand(f)]
-        scans = [
-            (str(file) if len(facts) == 1 else f"{file}:{scan.name}", scan)
-            for file, facts in found
-            if not isinstance(facts, GraphFacts)
-            for scan in facts
-        ]
-        skipped = [file for f in self.files for file in prose_files(f)]
-        notes = [f"{file}: holds no points, skipped." for file in skipped]
-        notes += unit_notes(scans)
-        if self.json:
-            files = [_entry(file, facts) for file, facts in found]
-            text = json.dumps({"files": files, "notes": notes}, indent=1)
-        else:
-            blocks = [_block(file, facts) for file, facts in found]
-            text = "\n\n".join([*blocks, *notes])
-        sys.stdout.write(text + "\n")
-        return 0
+    skipped = [file for f in command.files for file in prose_files(f)]
+    notes = [f"{file}: holds no points, skipped." for file in skipped]
+    notes += unit_notes(scans)
+    if command.json:
+        files = [_entry(file, facts) for file, facts in found]
+        text = json.dumps({"files": files, "notes": notes}, indent=1)
+    else:
+        blocks = [_block(file, facts) for file, facts in found]
+        text = "\n\n".join([*blocks, *notes])
+    sys.stdout.write(text + "\n")
+    return 0
 
 
 def _expand(path: Path) -> list[Path]:

@@ -12,11 +12,12 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from typing import NoReturn
 
 from jaxreg.app.folder import held
-from jaxreg.app.result import version
+from jaxreg.app.versions import version
 from jaxreg.io.errors import InputError, MissingExtraError
 
 
@@ -112,10 +113,10 @@ def _run(arguments: list[str]) -> int:
         os.environ["PYTHON_TYRO_BACKEND"] = "argparse"
     import tyro
 
-    from jaxreg.app.cli import commands, runtime
+    from jaxreg.app.cli.options import COMMANDS, Info
 
     command = tyro.cli(
-        commands.COMMANDS,
+        COMMANDS,
         prog="jaxreg",
         description=(
             "Registers 2D and 3D point sets rigidly, without an initial guess, and "
@@ -124,13 +125,17 @@ def _run(arguments: list[str]) -> int:
         args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
+    # What a command needs is imported when it is known which one it is.
+    module = import_module(f"jaxreg.app.cli.{type(command).__name__.lower()}")
+    if isinstance(command, Info):
+        return module.run(command)
+    from jaxreg.app.cli import runtime
+
     runtime.keep_compiled_programs()
-    if isinstance(command, commands.Info):
-        return command.run()
     line = os.fsencode(shlex.join(["jaxreg", *arguments]))
     session = runtime.Session(command, line.decode("utf-8", "backslashreplace"))
-    with held(command.out), command.computing():
-        code = command.run(session)
+    with held(command.out), runtime.computing(command):
+        code = module.run(command, session)
         if command.json:
             text = (command.out / "result.json").read_text(encoding="utf-8")
             sys.stdout.write(text)

@@ -2,143 +2,112 @@
 
 import dataclasses
 import hashlib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 import jaxreg
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Progress
 from jaxreg.app.cli import outputs
 from jaxreg.app.cli.inputs import Scans, check_point, load_scans, read_positions
-from jaxreg.app.cli.runtime import SearchOptions, Session
+from jaxreg.app.cli.options import Multiview, Order
+from jaxreg.app.cli.runtime import Session, key_of, method_of
 from jaxreg.app.pair_log import PairLog, Pairs
 from jaxreg.app.plot.results import result_of
-from jaxreg.app.result import Result, version
+from jaxreg.app.result import Result
+from jaxreg.app.versions import version
 from jaxreg.io.errors import InputError
 from jaxreg.io.poses.stanford import read_conf
 
 
-Order = Literal["any", "sequential"]
-
-
-@dataclass(frozen=True)
-class Multiview(SearchOptions):
-    """Bring scans into one frame, without an initial guess."""
-
-    scans: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]],
-        tyro.conf.arg(metavar="SCAN ...", help_behavior_hint="(required)"),
-    ]
-    """Files (PLY, XYZ, PCD, LAS, ...), a folder of these, or an archive (NPZ, E57)."""
-    truth: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="FILE.conf", help_behavior_hint="(default: none)"),
-    ] = None
-    """Poses as the Stanford repository has them, metres: adds a table of errors."""
-    order: Order = "any"
-    """Of the scans; sequential if each overlaps the next: fewer pairs are tried."""
-    viewpoint: Annotated[
-        tuple[float, ...] | None,
-        tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
-    ] = None
-    """Where the scanner stood in the frame of every scan, in its unit: often 0 0 0."""
-    positions: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
-    ] = None
-    """Lines NAME X Y [Z]: about where each scan's scanner stood; see --deviation."""
-    resume: bool = False
-    """Go on with the pairs that an interrupted run left in the output folder."""
-
-    def run(self, session: Session) -> int:
-        """Runs the command; returns the exit code."""
-        with session.timed("read"):
-            if not self.scans:
-                raise InputError(
-                    "No scans given.\nUsage: jaxreg multiview SCAN SCAN ..."
-                )
-            scans = load_scans(self.scans)
-            self.check_known(scans.points[0].shape[1])
-            _check_viewpoint(self.viewpoint, scans)
-            located = self._located(scans)
-            truth = None if self.truth is None else _read_truth(self.truth, scans)
-        for note in scans.notes:
-            session.console.print(note)
-        key, method, log = self.key(), self.method(), self._log(session, scans)
-        try:
-            with session.progress() as progress, session.timed("run", computes=True):
-                result = reconstruct_scans(
-                    scans,
-                    key,
-                    method,
-                    progress,
-                    self.order,
-                    log,
-                    self.viewpoint,
-                    located,
-                )
-        except KeyboardInterrupt as err:
-            if not len(log):
-                raise
-            raise KeyboardInterrupt(
-                f"pairs kept in {log.path}: {len(log)}; "
-                "the same command with --resume goes on from there"
-            ) from err
-        require_two_placed(result, scans)
-        errors = None if truth is None else outputs.pose_errors(result, *truth)
-        report(session, result, scans, errors)
-        log.remove()
-        return 0
-
-    def _located(self, scans: Scans) -> jaxreg.ScanPositions | None:
-        """About where the scanners stood, for scans moved to their middles."""
-        if self.positions is None:
-            return None
-        antenna = -scans.centred()[1]
-        if self.viewpoint is not None:
-            antenna = antenna + self.viewpoint
-        return jaxreg.ScanPositions(
-            read_positions(self.positions, scans), self.deviation, antenna
-        )
-
-    def _log(self, session: Session, scans: Scans) -> PairLog:
-        digest = hashlib.sha256(repr(scans.names).encode())
-        for points in scans.points:
-            digest.update(np.ascontiguousarray(points).tobytes())
-        run = {
-            "scans": digest.hexdigest(),
-            "seed": self.seed,
-            "viewpoint": self.viewpoint,
-            "upright": self.upright,
-            "positions": None
-            if self.positions is None
-            else [self.deviation, read_positions(self.positions, scans).tolist()],
-            "budget": self.budget,
-            "precision": self.precision,
-            "version": version("jaxreg"),
-        }
-        log = PairLog(
-            self.out / "pairs.jsonl",
-            run,
-            resume=self.resume,
-            num_scans=len(scans.names),
-            dim=scans.points[0].shape[1],
-        )
-        if log.damage is not None:
-            session.console.print(f"{log.path}: {log.damage}.")
-        if not self.resume and log.path.exists():
-            session.console.print(
-                f"{log.path}: pairs of an interrupted run, replaced by those of this "
-                "one; --resume would go on with them."
+def run(command: Multiview, session: Session) -> int:
+    """Runs the command; returns the exit code."""
+    with session.timed("read"):
+        if not command.scans:
+            raise InputError("No scans given.\nUsage: jaxreg multiview SCAN SCAN ...")
+        scans = load_scans(command.scans)
+        command.check_known(scans.points[0].shape[1])
+        _check_viewpoint(command.viewpoint, scans)
+        located = _located(command, scans)
+        truth = None if command.truth is None else _read_truth(command.truth, scans)
+    for note in scans.notes:
+        session.console.print(note)
+    key, method = key_of(command), method_of(command)
+    log = _log(command, session, scans)
+    try:
+        with session.progress() as progress, session.timed("run", computes=True):
+            result = reconstruct_scans(
+                scans,
+                key,
+                method,
+                progress,
+                command.order,
+                log,
+                command.viewpoint,
+                located,
             )
-        elif self.resume and not len(log):
-            session.console.print(f"{log.path}: no pairs to go on with, all are new.")
-        return log
+    except KeyboardInterrupt as err:
+        if not len(log):
+            raise
+        raise KeyboardInterrupt(
+            f"pairs kept in {log.path}: {len(log)}; "
+            "the same command with --resume goes on from there"
+        ) from err
+    require_two_placed(result, scans)
+    errors = None if truth is None else outputs.pose_errors(result, *truth)
+    report(session, result, scans, errors)
+    log.remove()
+    return 0
+
+
+def _located(command: Multiview, scans: Scans) -> jaxreg.ScanPositions | None:
+    """About where the scanners stood, for scans moved to their middles."""
+    if command.positions is None:
+        return None
+    antenna = -scans.centred()[1]
+    if command.viewpoint is not None:
+        antenna = antenna + command.viewpoint
+    return jaxreg.ScanPositions(
+        read_positions(command.positions, scans), command.deviation, antenna
+    )
+
+
+def _log(command: Multiview, session: Session, scans: Scans) -> PairLog:
+    digest = hashlib.sha256(repr(scans.names).encode())
+    for points in scans.points:
+        digest.update(np.ascontiguousarray(points).tobytes())
+    run = {
+        "scans": digest.hexdigest(),
+        "seed": command.seed,
+        "viewpoint": command.viewpoint,
+        "upright": command.upright,
+        "positions": None
+        if command.positions is None
+        else [command.deviation, read_positions(command.positions, scans).tolist()],
+        "budget": command.budget,
+        "precision": command.precision,
+        "version": version("jaxreg"),
+    }
+    log = PairLog(
+        command.out / "pairs.jsonl",
+        run,
+        resume=command.resume,
+        num_scans=len(scans.names),
+        dim=scans.points[0].shape[1],
+    )
+    if log.damage is not None:
+        session.console.print(f"{log.path}: {log.damage}.")
+    if not command.resume and log.path.exists():
+        session.console.print(
+            f"{log.path}: pairs of an interrupted run, replaced by those of this "
+            "one; --resume would go on with them."
+        )
+    elif command.resume and not len(log):
+        session.console.print(f"{log.path}: no pairs to go on with, all are new.")
+    return log
 
 
 def reconstruct_scans(

@@ -1,84 +1,66 @@
 """`jaxreg register`: one scan onto another."""
 
 import dataclasses
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import jax
 import numpy as np
-import tyro
 
 import jaxreg
 from jaxreg._core.status import Status
 from jaxreg.app.cli import outputs
 from jaxreg.app.cli.inputs import Scans, check_point, load_scans
-from jaxreg.app.cli.runtime import SearchOptions, Session
+from jaxreg.app.cli.options import Register
+from jaxreg.app.cli.runtime import Session, key_of, method_of
 from jaxreg.app.plot.results import result_of
 from jaxreg.app.result import Result
 from jaxreg.io.errors import InputError
 
 
-@dataclass(frozen=True)
-class Register(SearchOptions):
-    """Move one scan onto another, without an initial guess."""
-
-    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
-    """The scan that moves: PLY, XYZ, PCD, LAS, OBJ, ..., or FILE.npz:KEY."""
-    target: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
-    """The scan that stays; its frame is that of the result."""
-
-    position: Annotated[
-        tuple[float, ...] | None,
-        tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
-    ] = None
-    """About where the source's origin is in the target's frame; see --deviation."""
-
-    def run(self, session: Session) -> int:
-        """Runs the command; returns the exit code."""
-        with session.timed("read"):
-            scans = load_scans([self.target, self.source])
-        if len(scans.names) != 2:
-            raise InputError(
-                f"{self.target} and {self.source}: hold {len(scans.names)} scans.\n"
-                "Name one of each (FILE.npz:KEY), or use: jaxreg multiview"
-            )
-        for note in scans.notes:
-            session.console.print(note)
-        dim = scans.points[0].shape[1]
-        self.check_known(dim)
-        check_point(self.position, dim, "--position")
-        key, method = self.key(), self._located(self.method(), scans)
-        with session.progress() as progress, session.timed("run", computes=True):
-            progress("registering", 0, 1)
-            result, modes, covariances = _register(scans, key, method)
-            progress("registering", 1, 1)
-        if not result.placed[1]:
-            raise InputError(
-                f"{self.source} onto {self.target}: {result.status.name}.\n"
-                f"{result.status.advice}"
-            )
-        outputs.write_files(
-            session, result, scans.points, modes=modes, covariances=covariances
+def run(command: Register, session: Session) -> int:
+    """Runs the command; returns the exit code."""
+    with session.timed("read"):
+        scans = load_scans([command.target, command.source])
+    if len(scans.names) != 2:
+        raise InputError(
+            f"{command.target} and {command.source}: hold {len(scans.names)} scans.\n"
+            "Name one of each (FILE.npz:KEY), or use: jaxreg multiview"
         )
-        _show(session, result)
-        return 0
-
-    def _located(
-        self, method: jaxreg.ParticleFilter, scans: Scans
-    ) -> jaxreg.ParticleFilter:
-        """Knowing `position`, between scans that are moved to their middles."""
-        if self.position is None:
-            return method
-        target, source = (-middle for middle in scans.centred()[1])
-        prior = jaxreg.PartialPose(
-            up=(0, 0, 1) if self.upright else None,
-            position=self.position,
-            deviation=self.deviation,
-            source_scanner=source,
-            target_scanner=target,
+    for note in scans.notes:
+        session.console.print(note)
+    dim = scans.points[0].shape[1]
+    command.check_known(dim)
+    check_point(command.position, dim, "--position")
+    key, method = key_of(command), _located(command, scans)
+    with session.progress() as progress, session.timed("run", computes=True):
+        progress("registering", 0, 1)
+        result, modes, covariances = _register(scans, key, method)
+        progress("registering", 1, 1)
+    if not result.placed[1]:
+        raise InputError(
+            f"{command.source} onto {command.target}: {result.status.name}.\n"
+            f"{result.status.advice}"
         )
-        return dataclasses.replace(method, prior=prior)
+    outputs.write_files(
+        session, result, scans.points, modes=modes, covariances=covariances
+    )
+    _show(session, result)
+    return 0
+
+
+def _located(command: Register, scans: Scans) -> jaxreg.ParticleFilter:
+    """Knowing `position`, between scans that are moved to their middles."""
+    method = method_of(command)
+    if command.position is None:
+        return method
+    target, source = (-middle for middle in scans.centred()[1])
+    prior = jaxreg.PartialPose(
+        up=(0, 0, 1) if command.upright else None,
+        position=command.position,
+        deviation=command.deviation,
+        source_scanner=source,
+        target_scanner=target,
+    )
+    return dataclasses.replace(method, prior=prior)
 
 
 def _register(

@@ -1,17 +1,13 @@
-"""What every command shares: options, the screen, the clock, the compilation cache."""
+"""What every command shares: device, screen, clock, the compilation cache."""
 
 import contextlib
-import math
 import os
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
 import jax
-import tyro
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -25,82 +21,44 @@ from rich.progress import (
 
 import jaxreg
 from jaxreg._core.typing import Progress as ProgressCall
+from jaxreg.app.cli.options import Options, SearchOptions
 from jaxreg.io.errors import InputError
 
 
-_FILTER = jaxreg.ParticleFilter()
-Precision = Literal["float32", "float64"]
+@contextlib.contextmanager
+def computing(options: Options) -> Iterator[None]:
+    """On the device and in the precision that are asked for.
+
+    Raises:
+        InputError: if there is no such device.
+    """
+    if options.device != "auto":
+        _use_device(options.device)
+    # The precision ends with the block; the device is the process's.
+    with jax.enable_x64(options.precision == "float64"):
+        yield
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options:
-    """Options of every command."""
-
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("jaxreg-out")
-    """For the results; made if needed."""
-    seed: int = 0
-    """Of the random numbers, 0 to 2^31 - 1; the same one gives the same result."""
-    device: Literal["auto", "cpu", "gpu", "tpu"] = "auto"
-    """To compute on; auto takes an accelerator if JAX finds one."""
-    precision: Precision = "float32"
-    """Of the computation; float64 has more digits and takes longer."""
-    quiet: bool = False
-    """Print nothing but errors."""
-    json: bool = False
-    """Print the content of result.json to standard output, and nothing else there."""
-
-    @contextlib.contextmanager
-    def computing(self) -> Iterator[None]:
-        """On the device and in the precision that are asked for.
-
-        Raises:
-            InputError: if there is no such device.
-        """
-        if self.device != "auto":
-            _use_device(self.device)
-        # The precision ends with the block; the device is the process's.
-        with jax.enable_x64(self.precision == "float64"):
-            yield
-
-    def key(self) -> jax.Array:
-        """The key that the seed stands for."""
-        if not 0 <= self.seed < 2**31:
-            raise InputError(f"--seed {self.seed}: wanted a number from 0 to 2^31 - 1.")
-        return jax.random.key(self.seed)
+def key_of(options: Options) -> jax.Array:
+    """The key that the seed stands for."""
+    if not 0 <= options.seed < 2**31:
+        raise InputError(f"--seed {options.seed}: wanted a number from 0 to 2^31 - 1.")
+    return jax.random.key(options.seed)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SearchOptions(Options):
-    """Options of the commands that search for poses of scans."""
-
-    budget: int = _FILTER.num_prior
-    """Poses drawn at most for a pair of scans; more find harder pairs and take time."""
-    upright: bool = False
-    """The scanners were level: the last axis of every scan points up."""
-    deviation: float = 1.0
-    """Of positions that are given, in the unit of the scans."""
-
-    def method(self) -> jaxreg.ParticleFilter:
-        """The search of that size."""
-        least = 2 * _FILTER.num_modes
-        if not least <= self.budget <= 2**20:
-            raise InputError(
-                f"--budget {self.budget}: wanted a number from {least} to 2^20."
-            )
-        carried = min(_FILTER.num_particles, self.budget)
-        prior = jaxreg.PartialPose(up=(0, 0, 1)) if self.upright else None
-        return jaxreg.ParticleFilter(
-            num_prior=self.budget, num_particles=carried, prior=prior
+def method_of(options: SearchOptions) -> jaxreg.ParticleFilter:
+    """The search of that budget, knowing what is upright."""
+    usual = jaxreg.ParticleFilter()
+    least = 2 * usual.num_modes
+    if not least <= options.budget <= 2**20:
+        raise InputError(
+            f"--budget {options.budget}: wanted a number from {least} to 2^20."
         )
-
-    def check_known(self, dim: int) -> None:
-        """Requires 3D scans of what is upright, and a deviation above zero."""
-        if self.upright and dim != 3:
-            raise InputError("--upright: of 3D scans only, these are 2D.")
-        if not 0 < self.deviation < math.inf:
-            raise InputError(
-                f"--deviation {self.deviation}: wanted a number above zero."
-            )
+    carried = min(usual.num_particles, options.budget)
+    prior = jaxreg.PartialPose(up=(0, 0, 1)) if options.upright else None
+    return jaxreg.ParticleFilter(
+        num_prior=options.budget, num_particles=carried, prior=prior
+    )
 
 
 class Session:

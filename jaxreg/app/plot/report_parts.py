@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxreg._core.status import Status
-from jaxreg.app.result import versions
+from jaxreg.app.versions import versions
 
 
 def status_entry(status: Status) -> dict[str, str]:

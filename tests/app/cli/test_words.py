@@ -8,12 +8,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jaxreg
 from jaxreg.app.cli.main import main
+from jaxreg.app.cli.options import SearchOptions
 from jaxreg.io import MissingExtraError
 from tests.app.cli.stand_ins import (
+    CLOUD,
     FILES,
     GRAPH,
     POSES,
@@ -167,3 +170,23 @@ def test_without_plotly_the_other_files_are_written(
     said = capsys.readouterr().out
     assert "needs the package plotly" in said
     assert "report.html" not in said.split("Written to")[1]
+
+
+def test_help_and_facts_of_a_scan_load_no_jax(folder: Path):
+    np.save(folder / "scan.npy", CLOUD)
+    for words in (["--help"], ["register", "--help"], ["info", "scan.npy"]):
+        code = (
+            "import contextlib, sys\n"
+            "from jaxreg.app.cli.main import main\n"
+            f"with contextlib.suppress(SystemExit): main({words})\n"
+            "assert not {'jax', 'equinox', 'matplotlib'} & set(sys.modules)"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True
+        )
+        assert (done.returncode, done.stderr) == (0, ""), words
+        assert done.stdout
+
+
+def test_the_budget_that_help_tells_is_that_of_the_search():
+    assert SearchOptions().budget == jaxreg.ParticleFilter().num_prior
