@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import jaxreg as jr
 from jaxreg.graph import PoseGraph
 from jaxreg.graph.pose_graph import chordal_weights
 from jaxreg.io.errors import InputError
@@ -120,6 +121,50 @@ def test_of_indefinite_information_the_nearest_is_taken(tmp_path):
     kappa, tau = chordal_weights(graph)
     assert np.isfinite(kappa).all()
     assert np.asarray(tau)[1] > 0
+
+
+def test_a_coupling_too_large_leaves_the_precisions_of_se_sync(tmp_path):
+    rng = np.random.default_rng(0)
+    half = 100 * rng.normal(size=(4, 6, 6))
+    info = half @ half.swapaxes(1, 2)
+    info[1:, :3, 3:] *= 4
+    info[1:, 3:, :3] *= 4
+    assert (np.linalg.eigvalsh(info)[1:, 0] < -1e3).all()
+    ends = [(0, 1), (1, 2), (2, 3), (0, 3)]
+    text = "".join(
+        f"EDGE_SE3:QUAT {i} {j} {j - i} {0.01 * j} 0 0.01 0 {0.01 * j} 1 "
+        + " ".join(f"{x:.17g}" for x in matrix[np.triu_indices(6)])
+        + "\n"
+        for (i, j), matrix in zip(ends, info, strict=True)
+    )
+    path = tmp_path / "a.g2o"
+    path.write_text(text)
+    with jax.enable_x64(True):
+        with pytest.warns(UserWarning, match="3 of 4 edges have an indefinite"):
+            graph = read_g2o(path)
+        kappa, tau = chordal_weights(graph)
+        assert graph.information is not None
+        # As SE-Sync's reader has them, of the numbers that the file holds.
+        inverse = np.linalg.inv(info[:, :3, :3]), np.linalg.inv(info[:, 3:, 3:])
+        traces = np.trace(inverse, axis1=-2, axis2=-1)
+        np.testing.assert_allclose(tau, 3 / traces[0], rtol=1e-9)
+        np.testing.assert_allclose(kappa, 1.5 / traces[1], rtol=1e-9)
+        found = np.asarray(graph.information)
+        np.testing.assert_array_equal(found[0], info[0])
+        assert (np.linalg.eigvalsh(found)[:, 0] > 0).all()
+        # No more is taken from the coupling than has to be.
+        assert (np.linalg.eigvalsh(found)[1:, 0] < 1).all()
+        sol = jr.average(graph, jr.PoseGraphLM(jr.ChordalError()))
+        assert jr.Status(int(sol.status)) == jr.Status.CONVERGED
+        R, t = np.asarray(sol.T_world_i)[:, :3, :3], np.asarray(sol.T_world_i)[:, :3, 3]
+        T = np.asarray(graph.T_i_j)
+        i, j = np.array(ends).T
+        turned = R[j] - R[i] @ T[:, :3, :3]
+        moved = t[j] - t[i] - np.einsum("eij,ej->ei", R[i], T[:, :3, 3])
+        F = np.sum(1.5 / traces[1] * np.sum(turned**2, (1, 2)))
+        F += np.sum(3 / traces[0] * np.sum(moved**2, 1))
+        found = jr.metrics.chordal_objective(graph, sol.T_world_i)
+        np.testing.assert_allclose(found, F, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
