@@ -11,9 +11,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core.checks import as_float_array, check_mask, shown
 from jaxreg.geometry import lie
 from jaxreg.geometry.nearest_rotation import nearest_rotation
-from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
+from jaxreg.graph.pose_graph import (
+    PoseGraph,
+    check_graph,
+    check_poses,
+    chordal_weights,
+)
 
 
 Align = Literal["first", "best", "none"]
@@ -37,16 +43,21 @@ def align_poses(
     Returns:
         `T_true_world @ T_world_i`.
 
+    Raises:
+        ValueError, TypeError: for shapes and dtypes that do not fit, as do all here.
+
     Gradients: with respect to both sets of poses.
     """
+    return _aligned(*_checked(T_world_i, T_true_i, align, mask))
+
+
+def _aligned(T_world_i: Array, T_true_i: Array, align: Align, mask: Array) -> Array:
     if align == "none":
         return T_world_i
     if align == "first":
         return T_true_i[0] @ lie.inverse(T_world_i[0]) @ T_world_i
-    if align != "best":
-        raise ValueError(f"align: wanted 'first', 'best' or 'none', found {align!r}.")
     dtype = T_world_i.dtype
-    w = jnp.ones(T_world_i.shape[:1], dtype) if mask is None else mask.astype(dtype)
+    w = mask.astype(dtype)
     w = w / jnp.maximum(jnp.sum(w), 1)
     R_est, R_true = lie.rotation(T_world_i), lie.rotation(T_true_i)
     # Relative rotations R_true_i inv(R_est_i) are all the same up to error.
@@ -56,7 +67,27 @@ def align_poses(
     return lie.compose(lie.rotation(moved), lie.translation(moved) + shift)
 
 
-@eqx.filter_jit
+def _checked(
+    T_world_i: object, T_true_i: object, align: object, mask: object
+) -> tuple[Array, Array, Align, Array]:
+    """Two sets of as many poses, and which of them count."""
+    if not isinstance(align, str) or align not in ("first", "best", "none"):
+        raise ValueError(
+            f"align: wanted 'first', 'best' or 'none', found {shown(align)}."
+        )
+    T = as_float_array(T_world_i, "T_world_i")
+    if T.ndim != 3 or T.shape[1:] not in ((3, 3), (4, 4)) or not len(T):
+        raise ValueError(
+            f"T_world_i: wanted shape (v, 3, 3) or (v, 4, 4), found {T.shape}."
+        )
+    T_true = as_float_array(T_true_i, "T_true_i")
+    if T_true.shape != T.shape:
+        raise ValueError(
+            f"T_true_i: wanted shape {T.shape} like T_world_i, found {T_true.shape}."
+        )
+    return T, T_true, align, check_mask(mask, T.shape[:1], "mask")
+
+
 def rotation_errors(
     T_world_i: Float[Array, "v D D"],
     T_true_i: Float[Array, "v D D"],
@@ -64,12 +95,18 @@ def rotation_errors(
     mask: Bool[Array, " v"] | None = None,
 ) -> Float[Array, " v"]:
     """The angle between estimated and true rotation of each frame, in radians."""
-    T = align_poses(T_world_i, T_true_i, align, mask)
+    return _rotation_errors(*_checked(T_world_i, T_true_i, align, mask))
+
+
+@eqx.filter_jit
+def _rotation_errors(
+    T_world_i: Array, T_true_i: Array, align: Align, mask: Array
+) -> Array:
+    T = _aligned(T_world_i, T_true_i, align, mask)
     R = lie.rotation(T) @ jnp.swapaxes(lie.rotation(T_true_i), -1, -2)
     return lie.rotation_angle(R)
 
 
-@eqx.filter_jit
 def translation_errors(
     T_world_i: Float[Array, "v D D"],
     T_true_i: Float[Array, "v D D"],
@@ -77,7 +114,14 @@ def translation_errors(
     mask: Bool[Array, " v"] | None = None,
 ) -> Float[Array, " v"]:
     """The distance between estimated and true translation of each frame."""
-    T = align_poses(T_world_i, T_true_i, align, mask)
+    return _translation_errors(*_checked(T_world_i, T_true_i, align, mask))
+
+
+@eqx.filter_jit
+def _translation_errors(
+    T_world_i: Array, T_true_i: Array, align: Align, mask: Array
+) -> Array:
+    T = _aligned(T_world_i, T_true_i, align, mask)
     sq = jnp.sum((lie.translation(T) - lie.translation(T_true_i)) ** 2, axis=-1)
     return jnp.where(sq > 0, jnp.sqrt(jnp.where(sq > 0, sq, 1)), 0)
 
@@ -97,7 +141,8 @@ def rotation_error(
     >>> print(f"{metrics.rotation_error(turned, T):.3f}")  # pi / 2 on one of two
     0.785
     """
-    return _mean(rotation_errors(T_world_i, T_true_i, align, mask), mask)
+    checked = _checked(T_world_i, T_true_i, align, mask)
+    return _mean(_rotation_errors(*checked), checked[-1])
 
 
 def translation_error(
@@ -107,17 +152,15 @@ def translation_error(
     mask: Bool[Array, " v"] | None = None,
 ) -> Float[Array, ""]:
     """e_t of the MCC paper: the mean over the frames in `mask`, in their unit."""
-    return _mean(translation_errors(T_world_i, T_true_i, align, mask), mask)
+    checked = _checked(T_world_i, T_true_i, align, mask)
+    return _mean(_translation_errors(*checked), checked[-1])
 
 
-def _mean(x: Array, mask: Array | None) -> Array:
-    if mask is None:
-        return jnp.mean(x)
+def _mean(x: Array, mask: Array) -> Array:
     count = jnp.maximum(jnp.sum(mask), 1).astype(x.dtype)
     return jnp.sum(jnp.where(mask, x, 0)) / count
 
 
-@eqx.filter_jit
 def chordal_objective(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"]
 ) -> Float[Array, ""]:
@@ -127,6 +170,12 @@ def chordal_objective(
 
     Reference: Rosen, Carlone, Bandeira, Leonard 2019.
     """
+    one = check_graph(graph, "graph")
+    return _chordal_objective(one, check_poses(T_world_i, "T_world_i", one))
+
+
+@eqx.filter_jit
+def _chordal_objective(graph: PoseGraph, T_world_i: Array) -> Array:
     kappa, tau = chordal_weights(graph)
     i, j = graph.edges[:, 0], graph.edges[:, 1]
     gap = (T_world_i[j] - T_world_i[i] @ graph.T_i_j)[:, :-1]

@@ -164,7 +164,7 @@ def test_an_index_is_a_class():
         jr.ICP(index="box tree")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="ParticleFilter: index: wanted the class of"):
         jr.ParticleFilter(index=jr.ParticleFilter)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="IndexOptions: wanted the class of an index"):
+    with pytest.raises(TypeError, match="IndexOptions: kind: wanted the class"):
         jr.neighbours.IndexOptions("box tree")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="method: wanted a registration method"):
         jr.reconstruct(

@@ -6,25 +6,34 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
+
+from jaxreg._core.checks import TRACED
 
 
 Tree = TypeVar("Tree")
 Out = TypeVar("Out")
 
 
-def traced(default: float) -> Any:
+def traced(default: float | None) -> Any:
     """A float field held as an array, so that changing it does not recompile."""
-    return eqx.field(default=default, converter=_as_scalar)
+    return eqx.field(default=default, converter=_as_scalar, metadata={TRACED: True})
 
 
 def _as_scalar(x: float | Array) -> Array:
-    return jnp.asarray(x, dtype=jnp.result_type(float)) if _is_number(x) else x  # pyright: ignore[reportReturnType]
+    if not _is_number(x):
+        return x  # pyright: ignore[reportReturnType]
+    try:
+        return jnp.asarray(x, dtype=jnp.result_type(float))
+    except OverflowError:  # an integer of hundreds of digits: its check says so
+        return x  # pyright: ignore[reportReturnType]
 
 
 def _is_number(x: object) -> bool:
-    return isinstance(x, (int, float))
+    numbers = int, float, np.integer, np.floating
+    return isinstance(x, numbers) and not isinstance(x, bool)
 
 
 def cast_floats(tree: Tree, dtype: Any) -> Tree:

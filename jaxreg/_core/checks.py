@@ -1,5 +1,6 @@
 """Checks of arguments while tracing: they raise and name what was found and wanted."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, get_args
 
@@ -14,6 +15,8 @@ from jaxreg._core.typing import Key
 
 #: A rotation this far from orthonormal is projected, one further is refused.
 ROTATION_TOLERANCE = 1e-2
+#: In the metadata of a field: it holds a number that is traced.
+TRACED = "traced"
 
 
 def is_concrete(x: Any) -> bool:
@@ -23,16 +26,24 @@ def is_concrete(x: Any) -> bool:
 
 def as_host_array(x: object, name: str) -> np.ndarray:
     """Converts what `numpy.asarray` or DLPack takes to a NumPy array of numbers."""
-    if hasattr(x, "__dlpack__") and not isinstance(x, np.ndarray):
-        x = np.from_dlpack(x)  # pyright: ignore[reportArgumentType]
     try:
+        if hasattr(x, "__dlpack__") and not isinstance(x, np.ndarray | jax.Array):
+            x = np.from_dlpack(x)  # pyright: ignore[reportArgumentType]
         x = np.asarray(x)
-    except ValueError as err:
+    except (ValueError, TypeError, OverflowError) as err:
         raise ValueError(f"{name}: not a rectangular array of numbers.") from err
-    if x.dtype == object or x.dtype.kind in "SUV":
-        hint = "" if x.dtype == object else " Files are read by jaxreg.io."
+    if x.dtype.kind not in "biufc":
+        hint = " Files are read by jaxreg.io." if x.dtype.kind in "SUV" else ""
         raise TypeError(f"{name}: wanted numbers, found dtype {x.dtype}.{hint}")
     return x
+
+
+def as_host_numbers(x: object, name: str) -> np.ndarray:
+    """Real numbers in float64 on the host, of what is written to files."""
+    found = as_host_array(x, name)
+    if found.dtype.kind not in "iuf":
+        raise TypeError(f"{name}: wanted real numbers, found dtype {found.dtype}.")
+    return found.astype(np.float64)
 
 
 def as_float_array(x: object, name: str) -> Array:
@@ -47,6 +58,8 @@ def as_float_array(x: object, name: str) -> Array:
     """
     if not isinstance(x, jax.Array):
         x = as_host_array(x, name)
+        if x.dtype.kind in "fc" and x.dtype not in (np.float32, np.float64):
+            raise TypeError(f"{name}: wanted float32 or float64, found {x.dtype}.")
         if x.dtype == np.float64 and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
             x = x.astype(np.float32)
     # Of NumPy arrays `jnp.asarray` compiles a program for each size.
@@ -74,12 +87,12 @@ def check_mask(mask: object, shape: tuple[int, ...], name: str) -> Array:
     """Returns a boolean mask of `shape`; None stands for everything valid."""
     if mask is None:
         return jnp.ones(shape, dtype=bool)
-    out = mask if isinstance(mask, jax.Array) else jax.device_put(np.asarray(mask))
+    out = mask if isinstance(mask, jax.Array) else as_host_array(mask, name)
     if out.dtype != bool:
         raise TypeError(f"{name}: wanted a boolean mask, found dtype {out.dtype}.")
     if out.shape != shape:
         raise ValueError(f"{name}: wanted shape {shape}, found {out.shape}.")
-    return out
+    return out if isinstance(out, jax.Array) else jax.device_put(out)
 
 
 def check_pair(
@@ -116,7 +129,7 @@ def check_motion(T: Array, d: int, name: str) -> None:
         )
 
 
-def check_rigid(T: Array, name: str, scaled: bool = False) -> None:
+def check_rigid(T: Array | np.ndarray, name: str, scaled: bool = False) -> None:
     """Requires rotations without reflection, and without scale if not `scaled`.
 
     Traced ones are not looked at, nor those that are not finite: they end in a status.
@@ -126,12 +139,14 @@ def check_rigid(T: Array, name: str, scaled: bool = False) -> None:
     R = np.asarray(T, np.float64)[..., :-1, :-1]
     R = R.reshape(-1, *R.shape[-2:])
     R = R[np.all(np.isfinite(R), axis=(1, 2))]
-    gram = np.einsum("bij,bik->bjk", R, R)
+    with np.errstate(over="ignore", invalid="ignore"):
+        gram = np.einsum("bij,bik->bjk", R, R)
     if scaled:
         size = np.trace(gram, axis1=1, axis2=2) / R.shape[-1]
         gram = gram / np.maximum(size, np.finfo(size.dtype).tiny)[:, None, None]
     worst = np.max(np.abs(gram - np.eye(R.shape[-1])), initial=0)
-    if worst > ROTATION_TOLERANCE or np.any(np.linalg.det(R) < 0):
+    # Negated: of huge numbers it is NaN.
+    if not worst <= ROTATION_TOLERANCE or np.any(np.linalg.det(R) < 0):
         raise ValueError(
             f"{name}: wanted rigid motions, found a rotation that is not orthonormal "
             f"within {ROTATION_TOLERANCE:g} or is a reflection."
@@ -175,13 +190,40 @@ def check_instance(found: object, name: str, contract: Any) -> None:
     raise TypeError(f"{name}: wanted {wanted}, found {told(found, kind)}.")
 
 
+def check_method(found: object, contract: Any) -> None:
+    """Requires a method that follows a contract, of one number in each field.
+
+    More, for `vmap` over methods, are for it to hand out.
+    """
+    check_instance(found, "method", contract)
+    _check_scalars(found)
+
+
+def _check_scalars(part: Any) -> None:
+    for field in dataclasses.fields(part):
+        found = getattr(part, field.name)
+        if dataclasses.is_dataclass(found) and not isinstance(found, type):
+            _check_scalars(found)
+        elif field.metadata.get(TRACED) and np.ndim(found):
+            raise ValueError(
+                f"{type(part).__name__}: {field.name}: wanted one number, found shape "
+                f"{np.shape(found)}. Use jax.vmap over the call."
+            )
+
+
 def told(found: object, contract: type) -> str:
     """What was found where an instance of `contract` was wanted, for a message."""
     if isinstance(found, type):
         add = "; add ()" if issubclass(found, contract) else ""
         return f"the class {found.__name__}{add}"
-    short = isinstance(found, (str, int, float, type(None)))
-    return repr(found) if short else f"an object of {type(found).__name__}"
+    return shown(found)
+
+
+def shown(found: object) -> str:
+    """What was found, in a line."""
+    short = isinstance(found, (str, int, float, complex, type(None)))
+    text = repr(found) if short else ""
+    return text if 0 < len(text) < 80 else f"an object of {type(found).__name__}"
 
 
 def check_parts(method: object, **contracts: Any) -> None:
@@ -201,9 +243,23 @@ def check_count(found: object, name: str, least: int = 1) -> None:
     """Requires an integer of at least so much."""
     wanted = f"{name}: wanted an integer of at least {least}"
     if isinstance(found, bool) or not isinstance(found, (int, np.integer)):
-        raise TypeError(f"{wanted}, found {found!r}.")
+        raise TypeError(f"{wanted}, found {shown(found)}.")
     if found < least:
         raise ValueError(f"{wanted}, found {found}.")
+    if found >= 2**31:
+        raise ValueError(f"{name}: wanted an integer below 2^31, found {found:.3g}.")
+
+
+def check_flag(found: object, name: str) -> None:
+    """Requires True or False."""
+    if not isinstance(found, bool | np.bool_):
+        raise TypeError(f"{name}: wanted True or False, found {shown(found)}.")
+
+
+def check_callable(found: object, name: str) -> None:
+    """Requires what can be called, or None."""
+    if found is not None and not callable(found):
+        raise TypeError(f"{name}: wanted a function, or None, found {shown(found)}.")
 
 
 def check_positive(method: object, *names: str) -> None:
@@ -228,6 +284,17 @@ def check_shares(method: object, *names: str) -> None:
     )
 
 
+def _numbers(found: object) -> np.ndarray | None:
+    """A number, or an array of them for `vmap`; None for anything else."""
+    if not isinstance(found, int | float | np.generic | np.ndarray | jax.Array):
+        return None
+    try:
+        values = np.asarray(found)
+    except TypeError:  # keys
+        return None
+    return values if values.size and values.dtype.kind in "iuf" else None
+
+
 def _check_numbers(
     method: object,
     names: tuple[str, ...],
@@ -239,9 +306,9 @@ def _check_numbers(
         if not is_concrete(found):
             continue
         told = f"{type(method).__name__}: {name}: wanted {wanted}, found"
-        values = np.asarray(found)
-        if values.dtype.kind not in "iuf":
-            raise TypeError(f"{told} {found!r}.")
+        values = _numbers(found)
+        if values is None:
+            raise TypeError(f"{told} {shown(found)}.")
         # Negated: what is not a number does not fit.
         if not np.all(fits(values)):
             raise ValueError(f"{told} {values.tolist()}.")

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import overload
 
-from jaxreg._core.checks import check_count, check_instance, check_key
+from jaxreg._core.checks import check_callable, check_count, check_key, check_method
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
-from jaxreg.averaging.many import average_list, check_graph, check_init
+from jaxreg.averaging.many import average_list, check_init
 from jaxreg.averaging.methods.correntropy import Correntropy
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, check_graph
 
 
 @overload
@@ -88,7 +88,8 @@ def average(
     Raises:
         TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,
             `method` no averaging method, or `key` no key.
-        ValueError: if `init` has another shape than the poses, or the graphs of a list
+        ValueError: if `init` has another shape than the poses or is no rigid motion
+            within 1e-2, several graphs are given as one, or the graphs of a list
             differ in dimension or in whether they have information.
 
     Gradients: see the method. `T_world_i` always follows `init[0]`.
@@ -99,8 +100,9 @@ def average(
     search, whose draws depend on the number of edges.
     """
     method = Correntropy() if method is None else method
-    check_instance(method, "method", AbstractAverager)
+    check_method(method, AbstractAverager)
     check_count(batch_size, "batch_size")
+    check_callable(progress, "progress")
     key = None if key is None else check_key(key)
     if isinstance(graph, list | tuple):
         return average_list(graph, method, init, key, batch_size, progress)

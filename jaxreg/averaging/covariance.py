@@ -5,17 +5,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core.checks import shown
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
 
 
 #: Largest number of unknowns, k per frame, for which covariances are computed.
 COVARIANCE_LIMIT = 6000
 
 
-@eqx.filter_jit
 def pose_covariances(
     graph: PoseGraph, solution: AveragingSolution
 ) -> Float[Array, "v k k"]:
@@ -35,10 +35,30 @@ def pose_covariances(
         `(v, k, k)`; 0 for frame 0, NaN for frames that no trusted edge holds.
 
     Raises:
-        ValueError: for more than `COVARIANCE_LIMIT` unknowns; the matrix is dense.
+        ValueError: for more than `COVARIANCE_LIMIT` unknowns, as the matrix is dense;
+            and for a solution of another graph.
+        TypeError: for anything but a graph and a solution.
 
     Gradients: none (cut).
     """
+    check_graph(graph, "graph")
+    if not isinstance(solution, AveragingSolution):
+        raise TypeError(
+            f"solution: wanted an AveragingSolution, found {shown(solution)}."
+        )
+    check_poses(solution.T_world_i, "solution: T_world_i", graph)
+    if solution.edge_weight.shape != graph.weight.shape:
+        raise ValueError(
+            f"solution: wanted one of {graph.num_edges} edges, found "
+            f"{solution.edge_weight.shape}."
+        )
+    return _covariances(graph, solution)
+
+
+@eqx.filter_jit
+def _covariances(
+    graph: PoseGraph, solution: AveragingSolution
+) -> Float[Array, "v k k"]:
     graph, solution = jax.lax.stop_gradient((graph, solution))
     num, k = graph.num_poses, lie.tangent_dim(graph.dim)
     if num * k > COVARIANCE_LIMIT:

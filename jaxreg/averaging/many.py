@@ -10,13 +10,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxreg._core.checks import as_float_array, is_concrete
+from jaxreg._core.checks import check_rigid, is_concrete
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
 from jaxreg.batching.padding import rounded_up, stacked
 from jaxreg.batching.progress import tell
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
 
 
 # The least sizes that graphs are padded to.
@@ -26,26 +26,14 @@ _STAGE = "averaging graphs"
 _PIECE = 64
 
 
-def check_graph(graph: object, name: str) -> PoseGraph:
-    """Requires a PoseGraph."""
-    if not isinstance(graph, PoseGraph):
-        raise TypeError(
-            f"{name}: wanted a PoseGraph (see PoseGraph.from_edges), "
-            f"found {type(graph).__name__}."
-        )
-    return graph
-
-
 def check_init(
     init: object, graph: PoseGraph, name: str
 ) -> Float[Array, "v D D"] | None:
     """Requires a pose for each frame, or None."""
     if init is None:
         return None
-    wanted = (graph.num_poses, graph.dim + 1, graph.dim + 1)
-    found = as_float_array(init, name).astype(graph.T_i_j.dtype)
-    if found.shape != wanted:
-        raise ValueError(f"{name}: wanted shape {wanted}, found {found.shape}.")
+    found = check_poses(init, name, graph)
+    check_rigid(found, name)
     return found
 
 

@@ -25,13 +25,6 @@ _RADII = 0.2
 _SPACINGS = 2.0
 
 
-def _length(x: Array | float | None) -> Array | None:
-    """A float held as an array, so that changing it does not recompile."""
-    if isinstance(x, (int, float)):
-        return jnp.asarray(x, dtype=jnp.result_type(float))
-    return x
-
-
 class KernelCorrelation(AbstractRegistrar):
     """Local registration without correspondences: all pairs count, the close ones more.
 
@@ -73,7 +66,7 @@ class KernelCorrelation(AbstractRegistrar):
     `jaxreg.correlation.ascent` for why.
     """
 
-    bandwidth: Array | float | None = eqx.field(default=None, converter=_length)
+    bandwidth: Array | float | None = traced(None)
     max_steps: int = eqx.field(default=60, static=True)
     max_points: int = eqx.field(default=2048, static=True)
     tolerance: Array | float = traced(1e-4)

@@ -7,7 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxreg._core.checks import ROTATION_TOLERANCE, as_float_array, is_concrete
+from jaxreg._core.checks import (
+    ROTATION_TOLERANCE,
+    as_float_array,
+    as_host_array,
+    is_concrete,
+)
 
 
 class EdgeError(ValueError):
@@ -20,7 +25,7 @@ class EdgeError(ValueError):
 
 def check_ids(edges: object, num: int) -> Int[Array, "e 2"]:
     """Frames of edges as `(num, 2)` int32."""
-    ids = edges if isinstance(edges, jax.Array) else np.asarray(edges)
+    ids = edges if isinstance(edges, jax.Array) else as_host_array(edges, "edges")
     if not ids.size:
         ids = np.zeros((0, 2), np.int32)
     if ids.ndim != 2 or ids.shape != (num, 2):

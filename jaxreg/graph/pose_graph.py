@@ -8,7 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.checks import as_float_array, check_mask, is_concrete
+from jaxreg._core.checks import (
+    as_float_array,
+    check_count,
+    check_mask,
+    is_concrete,
+    shown,
+)
 from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.graph.edge_checks import (
@@ -101,8 +107,7 @@ class PoseGraph(eqx.Module):
         info = check_extra(information, (num, k, k), "information", dtype)
         if num_poses is None:
             num_poses = count_poses(ids, valid)
-        if num_poses < 1:
-            raise ValueError(f"num_poses: wanted at least 1, found {num_poses}.")
+        check_count(num_poses, "num_poses")
         check_ids_values(ids, valid, num_poses)
         motions = check_motions(motions, ids, valid)
         check_weights(weights, ids, valid)
@@ -204,6 +209,30 @@ class PoseGraph(eqx.Module):
             f"PoseGraph({of}{self.num_poses} poses in {self.dim}D, "
             f"{self.num_edges} edges, {self.T_i_j.dtype})"
         )
+
+
+def check_graph(graph: object, name: str) -> PoseGraph:
+    """Requires one PoseGraph."""
+    if not isinstance(graph, PoseGraph):
+        raise TypeError(
+            f"{name}: wanted a PoseGraph (see PoseGraph.from_edges), "
+            f"found {shown(graph)}."
+        )
+    if graph.edges.ndim != 2:
+        raise ValueError(
+            f"{name}: wanted one graph, found leading axes {graph.edges.shape[:-2]}. "
+            "Use jax.vmap, or a list of graphs."
+        )
+    return graph
+
+
+def check_poses(T: object, name: str, graph: PoseGraph) -> Float[Array, "v D D"]:
+    """Requires a pose for each frame of a graph, in its dtype."""
+    wanted = (graph.num_poses, graph.dim + 1, graph.dim + 1)
+    found = as_float_array(T, name).astype(graph.T_i_j.dtype)
+    if found.shape != wanted:
+        raise ValueError(f"{name}: wanted shape {wanted}, found {found.shape}.")
+    return found
 
 
 def chordal_weights(

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg._core.checks import as_host_numbers
+from jaxreg.graph.pose_graph import PoseGraph, check_graph
 from jaxreg.io.extras import require
 
 
@@ -51,10 +52,22 @@ def to_open3d(points: Any, colors: Any = None) -> Any:
     """
     open3d = require("open3d", "Making Open3D's clouds", "bench")
     cloud = open3d.geometry.PointCloud()
-    cloud.points = open3d.utility.Vector3dVector(np.asarray(points, np.float64))
+    cloud.points = open3d.utility.Vector3dVector(_points(points))
     if colors is not None:
-        cloud.colors = open3d.utility.Vector3dVector(np.asarray(colors, np.float64))
+        colors = as_host_numbers(colors, "colors")
+        if colors.shape != (len(cloud.points), 3):
+            raise ValueError(
+                f"colors: wanted shape ({len(cloud.points)}, 3), found {colors.shape}."
+            )
+        cloud.colors = open3d.utility.Vector3dVector(colors)
     return cloud
+
+
+def _points(points: Any) -> np.ndarray:
+    found = as_host_numbers(points, "points")
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise ValueError(f"points: wanted shape (n, 3), found {found.shape}.")
+    return found
 
 
 def to_trimesh(points: Any, colors: Any = None) -> Any:
@@ -68,7 +81,7 @@ def to_trimesh(points: Any, colors: Any = None) -> Any:
         MissingExtraError: if trimesh is not installed.
     """
     trimesh = require("trimesh", "Making trimesh's clouds")
-    return trimesh.PointCloud(np.asarray(points, np.float64), colors=colors)
+    return trimesh.PointCloud(_points(points), colors=colors)
 
 
 def to_open3d_graph(graph: PoseGraph, T_world_i: Any) -> Any:
@@ -85,8 +98,15 @@ def to_open3d_graph(graph: PoseGraph, T_world_i: Any) -> Any:
         MissingExtraError: if open3d is not installed.
     """
     o3d = require("open3d", "Making Open3D's graphs", "bench").pipelines.registration
+    if check_graph(graph, "graph").dim != 3:
+        raise ValueError(f"graph: wanted 3D, found {graph.dim}D.")
+    poses = as_host_numbers(T_world_i, "T_world_i")
+    if poses.shape != (graph.num_poses, 4, 4):
+        raise ValueError(
+            f"T_world_i: wanted shape ({graph.num_poses}, 4, 4), found {poses.shape}."
+        )
     out = o3d.PoseGraph()
-    for T in np.asarray(T_world_i, np.float64):
+    for T in poses:
         out.nodes.append(o3d.PoseGraphNode(T))
     info = np.tile(np.eye(6), (graph.num_edges, 1, 1))
     if graph.information is not None:
@@ -127,7 +147,12 @@ def to_gtsam(T_world_i: Any) -> Any:
     """
     gtsam = require("gtsam", "Making GTSAM's values", "bench")
     values = gtsam.Values()
-    for key, T in enumerate(np.asarray(T_world_i, np.float64)):
+    poses = as_host_numbers(T_world_i, "T_world_i")
+    if poses.ndim != 3 or poses.shape[1:] not in ((3, 3), (4, 4)):
+        raise ValueError(
+            f"T_world_i: wanted shape (v, 3, 3) or (v, 4, 4), found {poses.shape}."
+        )
+    for key, T in enumerate(poses):
         if len(T) == 4:
             values.insert(key, gtsam.Pose3(T))
         else:

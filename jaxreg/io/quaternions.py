@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 def motions_from_xyzw(translation: np.ndarray, xyzw: np.ndarray) -> np.ndarray:
     """`(e, 4, 4)` motions of translations and quaternions; these are normalised."""
     T = np.tile(np.eye(4), (len(xyzw), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(xyzw).as_matrix()
+    if len(xyzw):  # SciPy before 1.17 has no rotations of length zero
+        T[:, :3, :3] = Rotation.from_quat(xyzw).as_matrix()
     T[:, :3, 3] = translation
     return T
 

@@ -16,6 +16,7 @@ from jaxreg._core.arrays import cast_floats, traced
 from jaxreg._core.checks import (
     as_float_array,
     check_counts,
+    check_flag,
     check_not_negative,
     check_pair,
     check_parts,
@@ -126,6 +127,7 @@ class ICP(AbstractRegistrar):
         check_counts(self, max_steps=1, max_points=1)
         check_positive(self, "max_correspondence_distance", "width_end")
         check_not_negative(self, "tolerance")
+        check_flag(self.with_scale, "ICP: with_scale")
 
     def in_frames(self, frames: Frames) -> "ICP":
         """With the correspondence distance in radii."""

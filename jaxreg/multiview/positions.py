@@ -1,6 +1,7 @@
 """`ScanPositions`: about where scanners stood, as satellite fixes tell."""
 
 import dataclasses
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,11 +21,11 @@ def _places(x: object) -> Array:
         x = np.asarray(x)
         if x.ndim == 2 and len(x) and x.dtype.kind in "iuf":
             x = x - np.mean(x, axis=0, dtype=np.float64)
-    return as_float_array(x, "ScanPositions")
+    return as_float_array(x, "ScanPositions: position")
 
 
 def _antennas(x: object) -> Array | None:
-    return None if x is None else as_float_array(x, "ScanPositions")
+    return None if x is None else as_float_array(x, "ScanPositions: antenna")
 
 
 class ScanPositions(BriefModule):
@@ -44,6 +45,8 @@ class ScanPositions(BriefModule):
     Raises: ValueError for shapes that differ or do not fit the scans, for numbers that
         are not finite, and for a deviation that is not above zero.
     """
+
+    described: ClassVar[str] = "ScanPositions of the scans"
 
     position: Float[Array, "v d"] = eqx.field(converter=_places)
     deviation: Array | float = traced(1.0)

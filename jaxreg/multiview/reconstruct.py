@@ -12,7 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.arrays import cast_floats
-from jaxreg._core.checks import check_instance, check_key, is_concrete
+from jaxreg._core.checks import (
+    check_callable,
+    check_flag,
+    check_instance,
+    check_key,
+    check_method,
+    is_concrete,
+    shown,
+)
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
@@ -98,6 +106,9 @@ def reconstruct(
         Sandhu, Dambreville, Tannenbaum for the pairs; Zhu et al. for the averaging.
     """
     check_instance(positions, "positions", ScanPositions | None)
+    check_flag(hold_previous, "hold_previous")
+    check_callable(progress, "progress")
+    check_callable(on_pairs, "on_pairs")
     far = FarScans(scans, mask)
     points, row_mask = padded_scans(far.scans, mask)
     eyes = checked_viewpoints(far.viewpoints(viewpoints), points, row_mask)
@@ -105,7 +116,7 @@ def reconstruct(
     on_pairs = far.hears(on_pairs)
     points, eyes = jax.lax.stop_gradient((points, eyes))
     method = ParticleFilter() if method is None else method
-    check_instance(method, "method", AbstractRegistrar)
+    check_method(method, AbstractRegistrar)
     check_instance(averaging, "averaging", AbstractAverager | None)
     if hold_previous and not isinstance(previous, ReconstructionSolution):
         raise ValueError(
@@ -183,9 +194,9 @@ def _known(
 
 
 def _checked(order: str) -> Order:
-    if order == "any" or order == "sequential":
+    if isinstance(order, str) and (order == "any" or order == "sequential"):
         return order
-    raise ValueError(f"order: wanted 'any' or 'sequential', found {order!r}.")
+    raise ValueError(f"order: wanted 'any' or 'sequential', found {shown(order)}.")
 
 
 def _silent(stage: str, done: int, total: int) -> None:

@@ -3,6 +3,7 @@
 import inspect
 from typing import Any, TypeAlias
 
+from jaxreg._core.checks import shown, told
 from jaxreg._core.typing import Mask, Points
 from jaxreg.neighbours.base import AbstractIndex
 
@@ -20,8 +21,8 @@ class IndexOptions:
     def __init__(self, kind: type[AbstractIndex], **options: Any) -> None:
         if not _is_index(kind):
             raise TypeError(
-                "IndexOptions: wanted the class of an index such as VoxelTable, found "
-                f"{kind!r}."
+                "IndexOptions: kind: wanted the class of an index such as VoxelTable, "
+                f"found {shown(kind)}."
             )
         known = list(inspect.signature(kind.build).parameters)[2:]
         for name in options:
@@ -62,7 +63,7 @@ def check_index(method: object) -> None:
         return
     raise TypeError(
         f"{type(method).__name__}: index: wanted the class of an index such as "
-        f"BruteForce, IndexOptions of one, or None, found {found!r}."
+        f"BruteForce, IndexOptions of one, or None, found {told(found, AbstractIndex)}."
     )
 
 

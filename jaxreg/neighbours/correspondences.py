@@ -1,7 +1,6 @@
 """Which target point each source point falls on at a pose."""
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxreg._core.checks import as_float_array, check_motion, check_pair
@@ -62,7 +61,12 @@ def correspondences(
         raise ValueError(f"T_target_source: wanted one motion, found shape {T.shape}.")
     check_motion(T, source.shape[-1], "T_target_source")
     if max_distance is not None:  # an array: another distance compiles nothing
-        max_distance = jnp.asarray(max_distance, source.dtype)
+        max_distance = as_float_array(max_distance, "max_distance")
+        if max_distance.ndim:
+            raise ValueError(
+                f"max_distance: wanted one number, found shape {max_distance.shape}."
+            )
+        max_distance = max_distance.astype(source.dtype)
     return _find(source, target, T, max_distance, source_mask, target_mask)
 
 

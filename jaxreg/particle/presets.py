@@ -1,5 +1,8 @@
 """Settings of papers."""
 
+import numpy as np
+
+from jaxreg._core.checks import check_count, shown
 from jaxreg.local import GaussNewton, GradientDescent
 from jaxreg.matching import PointToPoint
 from jaxreg.particle.dynamics import AbstractDynamics, StochasticDynamics
@@ -44,8 +47,9 @@ def sandhu2010(
 
     Raises: ValueError for another d.
     """
-    if d not in (2, 3):
-        raise ValueError(f"sandhu2010: d must be 2 or 3, found {d!r}.")
+    if not isinstance(d, int | np.integer) or d not in (2, 3):
+        raise ValueError(f"sandhu2010: d must be 2 or 3, found {shown(d)}.")
+    check_count(num_particles, "sandhu2010: num_particles", 2)
     R = 7 if d == 2 else 3
     return ParticleFilter(
         num_prior=num_particles,

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.checks import (
     as_float_array,
+    check_callable,
     check_count,
-    check_instance,
     check_key,
+    check_method,
     check_motion,
     check_pair,
     check_rigid,
@@ -148,8 +149,9 @@ def register(
         arrays of 4 d + 1 bytes a row.
     """
     method = ParticleFilter() if method is None else method
-    check_instance(method, "method", AbstractRegistrar)
+    check_method(method, AbstractRegistrar)
     check_count(batch_size, "batch_size")
+    check_callable(progress, "progress")
     key = None if key is None else check_key(key)
     masks = source_mask, target_mask
     scaled = isinstance(method, ICP) and method.with_scale

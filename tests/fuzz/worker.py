@@ -1,4 +1,4 @@
-"""Reads damaged files under limits of time and memory; a line of JSON for each."""
+"""Runs cases under limits of time and memory; a line of JSON for each."""
 
 import argparse
 import json
@@ -7,85 +7,67 @@ import resource
 import signal
 import sys
 import tempfile
-import traceback
 import warnings
 from pathlib import Path
 
-import numpy as np
-
-from jaxreg.io import InputError, MissingExtraError
-from tests.fuzz.mutations import Damaged, damaged
-from tests.fuzz.samples import Sample, samples
+from tests.fuzz.call_cases import CallCases
+from tests.fuzz.file_cases import FileCases
 
 
-SECONDS, MEMORY = 10, 1 << 30
-
-
-def case(seed: int, number: int, found: list[Sample]) -> tuple[Sample, Damaged]:
-    """The damaged file of a number; its kind goes around."""
-    rng = np.random.default_rng([seed, number])
-    sample = found[number % len(found)]
-    return sample, damaged(rng, sample.name, sample.data)
-
-
-def outcome(path: Path, sample: Sample, made: Damaged, whole: list[np.ndarray]) -> str:
-    """How reading it ended: read, refused, or what is wrong with the end."""
-    try:
-        arrays = sample.read(path)
-    except (InputError, MissingExtraError) as err:
-        lines = str(err).splitlines()
-        if "more memory than there is" in lines[0]:
-            return "over memory"
-        if len(lines) > 2 or path.name not in lines[0]:
-            return f"traceback: no message of two lines: {lines}"
-        return "refused"
-    except MemoryError:
-        return "over memory"
-    except BaseException:
-        return "traceback: " + traceback.format_exc(limit=-3)
-    if sample.counted and made.seen and not _same(arrays, whole):
-        return "silent"
-    if not arrays or not all(len(a) for a in arrays):
-        return "silent"
-    return "read"
-
-
-def _same(one: list[np.ndarray], other: list[np.ndarray]) -> bool:
-    return len(one) == len(other) and all(
-        a.shape == b.shape and np.allclose(a, b, 1e-5, equal_nan=True)
-        for a, b in zip(one, other, strict=True)
-    )
+#: A case may take so much; calls that stand still are ended by the clock.
+SECONDS, CLOCK, MEMORY = 10, 60, 1 << 30
+KINDS = {
+    "files": FileCases,
+    "calls": CallCases,
+    "cheap calls": lambda: CallCases(dear=False),
+}
 
 
 def main() -> None:
     """Runs the cases of a range."""
     parser = argparse.ArgumentParser()
+    parser.add_argument("kind", choices=KINDS)
     parser.add_argument("seed", type=int)
     parser.add_argument("start", type=int)
     parser.add_argument("stop", type=int)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    found = samples()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        whole = {}
-        for sample in found:
-            Path(sample.name).write_bytes(sample.data)
-            whole[sample.name] = sample.read(Path(sample.name))
-        # Threads and libraries that are loaded by now take address space, not memory.
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-        limit = pages * resource.getpagesize() + MEMORY
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        cases = KINDS[options.kind]()
+        _limit_memory(options.kind)
         for number in range(options.start, options.stop):
-            sample, made = case(options.seed, number, found)
-            _say({"case": number, "kind": sample.name, "how": made.how})
-            path = Path(f"case-{made.name}")
-            path.write_bytes(made.data)
-            signal.setitimer(signal.ITIMER_REAL, SECONDS)
-            end = outcome(path, sample, made, whole[sample.name])
+            case = cases.make(options.seed, number)
+            what, how = cases.words(case)
+            _say({"case": number, "kind": what, "how": how})
+            # Seconds of its own: others may be at work here.
+            signal.setitimer(signal.ITIMER_PROF, SECONDS)
+            signal.setitimer(signal.ITIMER_REAL, CLOCK)
+            before = _peak(reset=True)
+            end = cases.run(case)
+            signal.setitimer(signal.ITIMER_PROF, 0)
             signal.setitimer(signal.ITIMER_REAL, 0)
-            path.unlink()
+            if _peak() - before > MEMORY:
+                end = "over memory"
             _say({"case": number, "end": end})
+
+
+def _limit_memory(kind: str) -> None:
+    # Threads and libraries that are loaded by now take address space, not memory, and
+    # so do programs that are compiled.
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    room = MEMORY if kind == "files" else 8 * MEMORY
+    limit = pages * resource.getpagesize() + room
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def _peak(reset: bool = False) -> int:
+    """Bytes held at most since it was reset."""
+    if reset:
+        Path("/proc/self/clear_refs").write_text("5")
+    lines = Path("/proc/self/status").read_text().splitlines()
+    words = next(line.split() for line in lines if line.startswith("VmHWM"))
+    return int(words[1]) * 1024
 
 
 def _say(line: dict) -> None:

@@ -75,7 +75,7 @@ def test_bad_values_name_the_edge_unless_masked(name, value, message):
         ({"weight": np.ones(3)}, r"weight: wanted shape \(4,\), found \(3,\)"),
         ({"information": np.ones((4, 3, 3))}, r"information: wanted shape \(4, 6, 6\)"),
         ({"mask": np.ones(3, bool)}, r"mask: wanted shape \(4,\)"),
-        ({"num_poses": 0}, "num_poses: wanted at least 1"),
+        ({"num_poses": 0}, "num_poses: wanted an integer of at least 1"),
         ({"edges": -EDGES}, "edges: ids must lie between"),
     ],
 )

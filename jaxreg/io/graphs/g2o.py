@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxreg._core.checks import as_host_array, as_host_numbers, check_rigid
 from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.graph.edge_checks import EdgeError
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, check_graph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 from jaxreg.io.files import text_lines
@@ -132,18 +133,22 @@ def write_g2o(
         ValueError: if `T_world_i` or `ids` do not belong to the graph.
         InputError: if the folder cannot be written.
     """
+    check_graph(graph, "graph")
     d, num = graph.dim, graph.num_poses
-    names = np.arange(num) if ids is None else np.asarray(ids)
+    names = as_host_array(np.arange(num) if ids is None else ids, "ids")
     if names.shape != (num,):
         raise ValueError(f"ids: wanted shape {(num,)}, found {names.shape}.")
+    if names.dtype.kind not in "iu" or len(np.unique(names)) != num:
+        raise ValueError("ids: wanted integers, each another.")
     digits = 9 if graph.T_i_j.dtype == jnp.float32 else 17
     lines = []
     if T_world_i is not None:
-        poses = np.asarray(T_world_i, dtype=np.float64)
+        poses = as_host_numbers(T_world_i, "T_world_i")
         if poses.shape != (num, d + 1, d + 1):
             raise ValueError(
                 f"T_world_i: wanted shape {(num, d + 1, d + 1)}, found {poses.shape}."
             )
+        check_rigid(poses, "T_world_i")
         lines += _lines(list(_VERTEX)[d - 2], names[:, None], _columns(poses), digits)
     keep = np.asarray(graph.mask)
     k = lie.tangent_dim(d)

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxreg._core.checks import check_rigid
 from jaxreg.graph.edge_checks import EdgeError
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, check_graph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
 from jaxreg.io.rows import ids, numbers, read_lines
@@ -53,11 +54,13 @@ def write_log(path: str | Path, graph: PoseGraph) -> None:
         ValueError: for a 2D graph.
         InputError: if the folder cannot be written.
     """
+    check_graph(graph, "graph")
     if graph.dim != 3:
         raise ValueError(f"graph: wanted 3D, found {graph.dim}D.")
     keep = np.asarray(graph.mask)
     edges = np.asarray(graph.edges)[keep]
     T_i_j = np.asarray(graph.T_i_j, dtype=np.float64)[keep]
+    check_rigid(T_i_j, "graph: T_i_j")
     with atomic_write(path) as file:
         for (i, j), T in zip(edges.tolist(), T_i_j, strict=True):
             file.write(f"{i}\t{j}\t{graph.num_poses}\n")

@@ -8,6 +8,7 @@ from types import ModuleType
 
 import numpy as np
 
+from jaxreg._core.checks import as_host_array, check_flag
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError, MissingExtraError
 from jaxreg.io.files import reading
@@ -140,7 +141,10 @@ def write_ply(
         MissingExtraError: if plyfile is not installed.
     """
     plyfile = _plyfile()
-    points = np.asarray(points)
+    points = as_host_array(points, "points")
+    if points.dtype.kind not in "iuf":
+        raise TypeError(f"points: wanted real numbers, found dtype {points.dtype}.")
+    check_flag(binary, "binary")
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise ValueError(
             f"points: wanted shape (n, 2) or (n, 3), found {points.shape}."
@@ -163,11 +167,15 @@ def write_ply(
 
 
 def _as_bytes(colors: np.ndarray, num: int) -> np.ndarray:
-    colors = np.asarray(colors)
+    colors = as_host_array(colors, "colors")
     if colors.shape != (num, 3):
         raise ValueError(f"colors: wanted shape ({num}, 3), found {colors.shape}.")
     if colors.dtype.kind == "f":
         colors = np.rint(np.clip(colors, 0, 1) * 255)
+    elif colors.dtype.kind not in "iu":
+        raise TypeError(f"colors: wanted uint8 or floats, found dtype {colors.dtype}.")
+    if not ((colors >= 0) & (colors <= 255)).all():
+        raise ValueError("colors: wanted numbers from 0 to 255, or floats in [0, 1].")
     return colors.astype(np.uint8)
 
 

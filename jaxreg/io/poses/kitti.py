@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxreg._core.checks import as_host_numbers, check_rigid
 from jaxreg._core.typing import ArrayLike
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
@@ -46,9 +47,10 @@ def write_kitti(path: str | Path, T_world_i: ArrayLike) -> None:
         ValueError: for wrong shapes.
         InputError: if the folder cannot be written.
     """
-    T = np.asarray(T_world_i, dtype=np.float64)
+    T = as_host_numbers(T_world_i, "T_world_i")
     if T.ndim != 3 or T.shape[1:] != (4, 4):
         raise ValueError(f"T_world_i: wanted shape (v, 4, 4), found {T.shape}.")
+    check_rigid(T, "T_world_i")
     with atomic_write(path) as file:
         for row in T[:, :3].reshape(-1, 12):
             file.write(" ".join(f"{x:.17g}" for x in row) + "\n")

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxreg._core.checks import as_host_numbers, check_rigid
 from jaxreg._core.typing import ArrayLike
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
@@ -29,14 +30,18 @@ def write_tum(
         ValueError: for wrong shapes.
         InputError: if the folder cannot be written.
     """
-    T = np.asarray(T_world_i, dtype=np.float64)
+    T = as_host_numbers(T_world_i, "T_world_i")
     if T.ndim != 3 or T.shape[1:] not in ((3, 3), (4, 4)):
         raise ValueError(
             f"T_world_i: wanted shape (v, 3, 3) or (v, 4, 4), found {T.shape}."
         )
-    times = np.arange(len(T)) if timestamps is None else np.asarray(timestamps)
+    check_rigid(T, "T_world_i")
+    times = np.arange(len(T)) if timestamps is None else timestamps
+    times = as_host_numbers(times, "timestamps")
     if times.shape != (len(T),):
         raise ValueError(f"timestamps: wanted shape {(len(T),)}, found {times.shape}.")
+    if not np.isfinite(times).all():
+        raise ValueError("timestamps: wanted finite numbers.")
     if T.shape[1] == 3:
         flat, T = T, np.tile(np.eye(4), (len(T), 1, 1))
         T[:, :2, :2], T[:, :2, 3] = flat[:, :2, :2], flat[:, :2, 2]

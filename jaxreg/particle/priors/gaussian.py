@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
@@ -36,7 +37,7 @@ class GaussianPrior(AbstractPrior):
         """Refuses spreads that leave a single pose."""
         both = (self.translation_spread, self.rotation_spread)
         check_not_negative(self, "translation_spread", "rotation_spread")
-        if all(is_concrete(s) and float(s) == 0 for s in both):
+        if all(is_concrete(s) and not np.any(s) for s in both):
             raise ValueError(
                 "GaussianPrior: translation_spread and rotation_spread are both 0, "
                 "which leaves one particle; use ICP from the guess."

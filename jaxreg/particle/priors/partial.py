@@ -1,6 +1,7 @@
 """What is known of the pose beforehand: which way is up, about where the scan was."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -10,15 +11,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import cast_floats, traced
-from jaxreg._core.checks import as_float_array, check_positive, is_concrete
+from jaxreg._core.checks import as_float_array, check_flag, check_positive, is_concrete
 from jaxreg._core.typing import Key, Motion, Scalar
 from jaxreg.geometry import lie
 from jaxreg.particle.priors.base import AbstractPrior
 from jaxreg.registrar import Frames
 
 
-def _vector(x: object) -> Array | None:
-    return None if x is None else as_float_array(x, "PartialPose")
+def _vector(name: str) -> Callable[[object], Array | None]:
+    def converted(x: object) -> Array | None:
+        return None if x is None else as_float_array(x, f"PartialPose: {name}")
+
+    return converted
 
 
 class PartialPose(AbstractPrior):
@@ -54,16 +58,18 @@ class PartialPose(AbstractPrior):
         `position` is given, for shapes that do not fit, and for an `up` of no length.
     """
 
-    up: Float[Array, "3"] | None = eqx.field(default=None, converter=_vector)
+    up: Float[Array, "3"] | None = eqx.field(default=None, converter=_vector("up"))
     tilt: Array | float = traced(0.035)
-    position: Float[Array, " d"] | None = eqx.field(default=None, converter=_vector)
+    position: Float[Array, " d"] | None = eqx.field(
+        default=None, converter=_vector("position")
+    )
     deviation: Array | float = traced(1.0)
     oriented: bool = eqx.field(default=True, static=True)
     source_scanner: Float[Array, " d"] | None = eqx.field(
-        default=None, converter=_vector
+        default=None, converter=_vector("source_scanner")
     )
     target_scanner: Float[Array, " d"] | None = eqx.field(
-        default=None, converter=_vector
+        default=None, converter=_vector("target_scanner")
     )
     translation_spread: Array | float = traced(0.5)
     frames: Frames | None = None
@@ -71,6 +77,7 @@ class PartialPose(AbstractPrior):
     def __check_init__(self) -> None:
         """Refuses what says nothing, or nothing that can be."""
         check_positive(self, "tilt", "deviation", "translation_spread")
+        check_flag(self.oriented, "PartialPose: oriented")
         if self.up is None and self.position is None:
             raise ValueError("PartialPose: wanted up, position or both, found neither.")
         for name, found in self._vectors():
