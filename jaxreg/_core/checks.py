@@ -163,9 +163,9 @@ def check_key(key: Key | None, name: str = "key") -> Key:
         raise TypeError(
             f"{name}: wanted jax.random.key(seed), found {type(key).__name__}."
         )
-    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and not key.ndim:
         return key
-    if key.dtype == jnp.uint32 and key.shape[-1:] == (2,):
+    if key.dtype == jnp.uint32 and key.shape == (2,):
         return jax.random.wrap_key_data(key)
     raise TypeError(
         f"{name}: wanted jax.random.key(seed), found an array of dtype {key.dtype} "

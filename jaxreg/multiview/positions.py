@@ -10,7 +10,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.brief import BriefModule
-from jaxreg._core.checks import as_float_array, check_positive, is_concrete
+from jaxreg._core.checks import (
+    as_float_array,
+    as_host_array,
+    check_positive,
+    is_concrete,
+)
 from jaxreg.particle import AbstractSearch, PartialPose
 from jaxreg.registrar import AbstractRegistrar
 
@@ -18,7 +23,7 @@ from jaxreg.registrar import AbstractRegistrar
 def _places(x: object) -> Array:
     """Rows less their mean if they are concrete: map coordinates are long."""
     if not eqx.is_array(x) or is_concrete(x):
-        x = np.asarray(x)
+        x = as_host_array(x, "ScanPositions: position")
         if x.ndim == 2 and len(x) and x.dtype.kind in "iuf":
             x = x - np.mean(x, axis=0, dtype=np.float64)
     return as_float_array(x, "ScanPositions: position")

@@ -5,6 +5,7 @@ ended by SIGTERM, 129 by SIGHUP, 141 when nobody reads the output any more.
 """
 
 import _thread
+import contextlib
 import io
 import os
 import shlex
@@ -76,26 +77,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     arguments = arguments or ["--help"]
-    if arguments in (["--version"], ["-V"]):
-        sys.stdout.write(f"jaxreg {version('jaxreg')}\n")
-        return 0
-    if sys.stdout is None:  # closed by the caller
-        sys.stdout = open(os.devnull, "w")
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller
+            setattr(sys, name, open(os.devnull, "w"))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names need not be UTF-8
     try:
-        return _run(arguments)
+        code = _run(arguments)
+        sys.stdout.flush()  # what is not written now would fail behind Python's end
+        return code
     except (InputError, MissingExtraError) as err:
         sys.stderr.write(f"jaxreg: {err}\n")
         return 2
     except BrokenPipeError:  # as in `jaxreg ... | head`: nobody reads on
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return _UNREAD
     except OSError as err:
         where = f"{err.filename}: " if err.filename else ""
         sys.stderr.write(
-            f"jaxreg: {where}{err.strerror or err}; nothing was written.\n"
+            f"jaxreg: {where}{err.strerror or err}; no results were written.\n"
         )
+        _drop_output()
         return 2
     except KeyboardInterrupt as err:
         kept = str(err) or "no results were written"
@@ -103,7 +105,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _INTERRUPTED
 
 
+def _drop_output() -> None:
+    """What standard output cannot take is not tried again at Python's end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _run(arguments: list[str]) -> int:
+    if arguments in (["--version"], ["-V"]):
+        sys.stdout.write(f"jaxreg {version('jaxreg')}\n")
+        return 0
     # All of them now: nobody wants to learn it when the results are to be written.
     for package in ("tyro", "shtab", "rich", "plyfile", "matplotlib"):
         if find_spec(package) is None:

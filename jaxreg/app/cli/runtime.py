@@ -2,10 +2,13 @@
 
 import contextlib
 import os
+import re
 import sys
 import time
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 from rich.console import Console
@@ -23,6 +26,9 @@ import jaxreg
 from jaxreg._core.typing import Progress as ProgressCall
 from jaxreg.app.cli.options import Options, SearchOptions
 from jaxreg.io.errors import InputError
+
+
+_CACHE_TROUBLE = re.compile("Error (reading|writing) persistent compilation cache")
 
 
 @contextlib.contextmanager
@@ -130,6 +136,7 @@ def keep_compiled_programs() -> None:
     `JAX_COMPILATION_CACHE_DIR` is honoured, then `XDG_CACHE_HOME`. Must be called
     before the first compilation.
     """
+    warnings.showwarning = _told_once(warnings.showwarning)
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -145,6 +152,24 @@ def keep_compiled_programs() -> None:
             return
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _told_once(show: Callable[..., None]) -> Callable[..., None]:
+    """Says in a line what JAX warns of for each program that it cannot read or keep."""
+    told: list[str] = []
+
+    def once(message: Warning | str, *others: Any, **named: Any) -> None:
+        if not _CACHE_TROUBLE.match(str(message)):
+            show(message, *others, **named)
+        elif not told:
+            told.append(str(message))
+            sys.stderr.write(
+                f"jaxreg: {jax.config.values['jax_compilation_cache_dir']}: programs "
+                "kept there cannot be read, or no new ones kept; they are compiled "
+                "each time. Remove the folder if that stays so.\n"
+            )
+
+    return once
 
 
 def _is_mine(folder: Path) -> bool:

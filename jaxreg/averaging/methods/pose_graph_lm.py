@@ -67,7 +67,9 @@ class PoseGraphLM(AbstractAverager):
     kernel_width: Array | float = traced(3.0)
     max_steps: int = eqx.field(static=True, default=50)
     tolerance: Array | float = traced(1e-6)
-    initialiser: AbstractAverager = MotionAveraging(max_steps=3)
+    initialiser: AbstractAverager = eqx.field(
+        default_factory=lambda: MotionAveraging(max_steps=3)
+    )
 
     def __check_init__(self) -> None:
         """Refuses parts, counts and numbers that it cannot use."""

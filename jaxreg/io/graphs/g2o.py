@@ -157,7 +157,9 @@ def write_g2o(
         np.eye(k) if graph.information is None else np.asarray(graph.information)[keep]
     )
     upper = (weight * info)[:, *np.triu_indices(k)]
-    motions = _columns(np.asarray(graph.T_i_j, dtype=np.float64)[keep])
+    T_i_j = np.asarray(graph.T_i_j, dtype=np.float64)[keep]
+    check_rigid(T_i_j, "graph: T_i_j")
+    motions = _columns(T_i_j)
     values = np.concatenate([motions, upper], axis=1)
     lines += _lines(
         list(_EDGE)[d - 2], names[np.asarray(graph.edges)[keep]], values, digits

@@ -1,6 +1,8 @@
 """The folder of compiled programs is used only if it is the user's alone."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -28,5 +30,51 @@ def test_a_folder_that_others_may_write_to_is_not_used(
     assert "others may write there" in capsys.readouterr().err
     folder.chmod(0o700)
     monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
+    keep_compiled_programs()
+    assert used == {}
+
+
+def test_damaged_programs_are_compiled_anew_and_told_of_once(tmp_path: Path):
+    code = """
+import pathlib, sys
+import jax, jax.numpy as jnp
+from jaxreg.app.cli.runtime import keep_compiled_programs
+
+keep_compiled_programs()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+def both():
+    jax.clear_caches()
+    return jax.jit(lambda x: x * 3)(2.0), jax.jit(lambda x: x + 5)(2.0)
+
+both()
+kept = sorted(pathlib.Path(sys.argv[1]).glob("*-cache"))
+kept[0].write_bytes(kept[0].read_bytes()[:99])
+for path in kept[1:]:
+    path.write_bytes(bytes(range(256)))
+print(len(kept) > 1, *map(float, both()))
+"""
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    folder = tmp_path / "jaxreg"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(folder)],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    assert done.stdout == "True 6.0 7.0\n"
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith(f"jaxreg: {folder}: programs kept there cannot be")
+
+
+def test_a_cache_that_cannot_be_made_is_done_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    used: dict[str, object] = {}
+    monkeypatch.setattr(jax.config, "update", used.__setitem__)
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     keep_compiled_programs()
     assert used == {}

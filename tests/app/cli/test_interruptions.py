@@ -100,6 +100,18 @@ def test_a_reader_who_leaves_is_no_error():
     assert (done.returncode, done.stderr) == (141, b"")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="not on this system")
+@pytest.mark.parametrize(
+    ("words", "code", "lines"),
+    [("info s0.npy >/dev/full", 2, 1), ("--version >&- 2>&-", 0, 0)],
+)
+def test_output_that_nobody_can_take(folder: Path, words: str, code: int, lines: int):
+    save_scans(folder)
+    command = f"exec {sys.executable} -m jaxreg {words}"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True)
+    assert (done.returncode, len(done.stderr.splitlines())) == (code, lines)
+
+
 def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
