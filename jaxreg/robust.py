@@ -65,7 +65,7 @@ class AbstractKernel(BriefModule):
         Returns:
             The width; zero where nothing is valid.
 
-        Gradients: none.
+        Gradients: by the residual that it is taken from.
         """
 
 

@@ -74,7 +74,9 @@ def test_values_that_are_masked_may_be_anything():
     assert float(masked_quantile(x, mask & False, 0.5)) == 0
 
 
-def test_it_carries_no_gradient():
+def test_its_gradient_is_that_of_the_value_that_it_is():
     x = jnp.asarray([3.0, 1.0, 2.0])
-    slope = jax.grad(lambda x: masked_quantile(x, x > 0, 0.5) * x[0])(x)
-    np.testing.assert_array_equal(slope, [2, 0, 0])
+    slope = jax.grad(lambda x: masked_quantile(x, x > 1, 0.5) ** 2 * x[0])(x)
+    np.testing.assert_array_equal(slope, [4, 0, 12])
+    nothing = jax.grad(lambda x: masked_quantile(x, x > 9, 0.5))(x)
+    np.testing.assert_array_equal(nothing, 0)

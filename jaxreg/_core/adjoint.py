@@ -1,4 +1,7 @@
-"""How derivatives pass a loop: the names are those of optimistix and diffrax."""
+"""How derivatives pass a loop, or do not.
+
+The names are those of optimistix and diffrax.
+"""
 
 import abc
 from collections.abc import Callable
@@ -12,6 +15,17 @@ from jaxtyping import Array
 
 State = TypeVar("State")
 Tree = TypeVar("Tree")
+
+
+@eqx.filter_custom_jvp
+def refusing(out: Tree, by: object, told: str) -> Tree:
+    """`out`, which raises a TypeError where it is differentiated through `by`."""
+    return out
+
+
+@refusing.def_jvp
+def _refusing_jvp(primals: tuple, tangents: tuple) -> tuple:
+    raise TypeError(primals[2])
 
 
 class AbstractAdjoint(eqx.Module):

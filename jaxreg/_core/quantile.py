@@ -8,6 +8,7 @@ and 100,000 values in float32: 0.4 to 0.9 against 0.04 ms, 42 to 52 against 1.4 
 bits lose.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -27,9 +28,29 @@ def masked_quantile(
     Returns:
         One of the valid values, in the dtype of `x`; zero where nothing is valid.
 
-    Gradients: none.
+    Gradients: of that value alone, at the row where it was found.
     """
-    x = lax.stop_gradient(x)
+    return _one_of(x, mask, _value_of(lax.stop_gradient(x), mask, share))
+
+
+@jax.custom_jvp
+def _one_of(x: Array, mask: Array, value: Array) -> Array:
+    """The value, as a function of the row of x that holds it."""
+    return value
+
+
+@_one_of.defjvp
+def _one_of_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    x, mask, value = primals
+    found = mask & (jnp.abs(lax.stop_gradient(x)) == value)
+    slope = jnp.where(jnp.any(found), tangents[0][jnp.argmax(found)], 0)
+    return _one_of(x, mask, value), slope
+
+
+def _value_of(
+    x: Float[Array, " n"], mask: Bool[Array, " n"], share: Float[Array, ""] | float
+) -> Float[Array, ""]:
+    """Bit by bit."""
     kind, bits = (jnp.int32, 31) if x.dtype == jnp.float32 else (jnp.int64, 63)
     # abs: the sign bit of -0.0 would make it the least integer.
     keys = lax.bitcast_convert_type(jnp.abs(x), kind)

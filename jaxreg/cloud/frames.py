@@ -6,7 +6,6 @@ the input nor where it lies matters.
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.typing import Motion, Scalar
@@ -40,11 +39,10 @@ class Side(eqx.Module):
         points, mask = cloud
         mask = mask & jnp.all(jnp.isfinite(points), axis=1)
         points = jnp.where(mask[:, None], points, 0)
-        frozen = lax.stop_gradient(points)
-        radius = rms_radius(frozen, mask)
+        radius = rms_radius(points, mask)
         radius = jnp.where(radius > 0, radius, 1)
-        enough = _distinct_enough(frozen, mask)
-        return cls(points, mask, centroid(frozen, mask), radius, enough)
+        enough = _distinct_enough(points, mask)
+        return cls(points, mask, centroid(points, mask), radius, enough)
 
 
 class Frames(eqx.Module):

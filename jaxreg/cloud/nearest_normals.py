@@ -6,6 +6,7 @@ of the orientation of the axes, and ten times slower.
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Mask, Points
@@ -32,10 +33,14 @@ def normals_from_neighbours(
     A place stands for `count` points with mean there and summed outer products of
     offsets `spread`; a normal is the direction of least spread of all the points of
     the nearest places, itself among them.
+
+    Gradients: of the normals by places and spread, which places are near is held; the
+    spacing is cut.
     """
     d = places.shape[1]
     k = min(num_neighbours, places.shape[0])
-    found = BruteForce.build(places, mask).query(places, k)
+    frozen = lax.stop_gradient(places)
+    found = BruteForce.build(frozen, mask).query(frozen, k)
     row, valid = found.index.T, found.valid.T
     weight = jnp.where(valid, count[row], 0)
     total = jnp.maximum(jnp.sum(weight, axis=0), 1)

@@ -5,10 +5,15 @@ are those of its 2^d nearest cells with multilinear weights, so the window of ab
 cells moves with the place; the direction of least spread is the normal (Hoppe et al.
 1992). Where the window holds too little to span a plane, cells of two and four times
 the size answer. One sort, O(n) memory.
+
+Derivatives hold which cell a point is in, and which level answers a place; places,
+points and the size of the cells move. They are those of the eigenvectors at the levels
+that answered, which are not searched for again.
 """
 
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,33 +54,96 @@ def normals_from_cells(
         size: side of those cells.
         finest: windows are made of cells of 2^finest times that size first, then of
             twice as large ones.
+
+    Gradients: exact by places, points and size, in O(p + n) memory.
     """
+    frozen = lax.stop_gradient((places, mask, points, keys, size, finest))
+    normals, level = _search(*frozen)
+    return _with_slopes(_Windows(normals, level, places, points, keys, size))
+
+
+class _Windows(eqx.Module):
+    """What normals depend on: `normals` and `level` themselves are held."""
+
+    normals: Float[Array, "p d"]
+    level: Int[Array, " p"]
+    places: Float[Array, "p d"]
+    points: Float[Array, "n d"]
+    keys: Int[Array, " n"]
+    size: Scalar
+
+    def again(self) -> Float[Array, "p d"]:
+        """The normals by the levels that are known; zero of places without."""
+
+        def at_level(normals: Array, level: Array) -> Array:
+            cells = _moments_of_cells(self.points, self.keys, self.size, level)
+            vectors = _least_spread(self.places, cells, self.size, level)[0]
+            return jnp.where(self.level == level, vectors, normals)
+
+        @jax.checkpoint
+        def fill(normals: Array, level: Array) -> tuple[Array, None]:
+            used = jnp.any(self.level == level)
+            return lax.cond(used, at_level, lambda x, _: x, normals, level), None
+
+        levels = jnp.arange(_COARSEST + 1, dtype=jnp.int32)
+        return lax.scan(fill, jnp.zeros_like(self.places.T), levels)[0].T
+
+
+@eqx.filter_custom_jvp
+def _with_slopes(at: _Windows) -> Float[Array, "p d"]:
+    """The normals; nothing is computed for their derivatives until those are asked."""
+    return at.normals
+
+
+@_with_slopes.def_jvp
+def _with_slopes_jvp(primals: tuple[_Windows], tangents: tuple) -> tuple[Array, Array]:
+    normals = _with_slopes(*primals)
+    slope = eqx.filter_jvp(lambda at: at.again(), primals, tangents)[1]
+    return normals, jnp.zeros_like(normals) if slope is None else slope
+
+
+def _search(
+    places: Float[Array, "p d"],
+    mask: Bool[Array, " p"],
+    points: Float[Array, "n d"],
+    keys: Int[Array, " n"],
+    size: Scalar,
+    finest: int | Int[Array, ""],
+) -> tuple[Float[Array, "p d"], Int[Array, " p"]]:
+    """The normals, and the levels of the cells that they come from; -1 of none."""
     d, p = points.shape[1], places.shape[0]
     width = min(_BLOCK, p)
 
     def unfinished(state: tuple[Array, ...]) -> Array:
-        level, _, done = state
+        level, _, _, done = state
         return (level <= _COARSEST) & ~jnp.all(done)
 
     def fill(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        level, normals, done = state
+        level, normals, levels, done = state
         cells = _moments_of_cells(points, keys, size, level)
         # Few places need the coarser levels: those without a normal come first.
         rows = rows_in_order(done.astype(jnp.int32), 1)
 
-        def block(b: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-            normals, done = state
+        def block(b: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+            normals, levels, done = state
             at = lax.dynamic_slice_in_dim(rows, b * width, width)
             vectors, spans = _least_spread(places[at], cells, size, level)
-            vectors = jnp.where(spans & ~done[at], vectors, normals[:, at])
-            return normals.at[:, at].set(vectors), done.at[at].set(done[at] | spans)
+            new = spans & ~done[at]
+            vectors = jnp.where(new, vectors, normals[:, at])
+            return (
+                normals.at[:, at].set(vectors),
+                levels.at[at].set(jnp.where(new, level, levels[at])),
+                done.at[at].set(done[at] | spans),
+            )
 
         blocks = -(-jnp.sum(~done) // width)
-        normals, done = lax.fori_loop(0, blocks, block, (normals, done))
-        return level + 1, normals, done
+        out = lax.fori_loop(0, blocks, block, (normals, levels, done))
+        return level + 1, *out
 
-    start = (jnp.asarray(finest, jnp.int32), jnp.zeros((d, p), points.dtype), ~mask)
-    return lax.while_loop(unfinished, fill, start)[1].T
+    level, none = jnp.asarray(finest, jnp.int32), jnp.full(p, -1, jnp.int32)
+    start = level, jnp.zeros((d, p), points.dtype), none, ~mask
+    _, normals, levels, _ = lax.while_loop(unfinished, fill, start)
+    return normals.T, levels
 
 
 def _least_spread(

@@ -130,4 +130,6 @@ def rms_radius(points: Points, mask: Mask) -> Float[Array, ""]:
     """Root mean square distance of the valid points from their centroid."""
     offset = jnp.where(mask[:, None], points - centroid(points, mask), 0)
     num = jnp.maximum(jnp.sum(mask), 1).astype(points.dtype)
-    return jnp.sqrt(jnp.sum(offset**2) / num)
+    mean = jnp.sum(offset**2) / num
+    # The root of zero has no finite slope.
+    return jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1)), 0)

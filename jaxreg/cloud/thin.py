@@ -39,15 +39,15 @@ def thin(
         num_neighbours: static; normals are estimated from the points around that many
             nearest places, or by `estimate_normals`' cells, ten times faster.
 
-    Gradients: with respect to the points through the means; normals are cut.
+    Gradients: by the points, of the means and the normals; which cell a point is in,
+    and so which points are merged, is held. The spacing around each is cut.
     """
     n = points.shape[0]
     merge = n > capacity
     low, size, rows, keys = _cells(points, mask, capacity if merge else None)
     ordered, valid = points[rows] - low, mask[rows]
     places = jnp.where(valid[:, None], ordered, 0)
-    samples = lax.stop_gradient(places)
-    num = jnp.sum(mask)
+    samples, num = places, jnp.sum(mask)
     cell = jnp.arange(n, dtype=jnp.int32)
     if merge:
         cell = jnp.where(num > capacity, _cell_numbers(keys), cell)
@@ -56,18 +56,18 @@ def thin(
         count = jax.ops.segment_sum(count, cell, capacity)
         total = jax.ops.segment_sum(places, cell, capacity)
         places, valid = total / jnp.maximum(count, 1)[:, None], count > 0
-    frozen, spacing = lax.stop_gradient(places), None
+    spacing = None
     if num_neighbours is None:
         # Cells that merge many points are windows already.
         finest = jnp.where(num >= _MANY * capacity, 0, 1)
-        normals = normals_from_cells(frozen, valid, samples, keys, size, finest)
+        normals = normals_from_cells(places, valid, samples, keys, size, finest)
     else:
-        offset = jnp.where(keys[:, None] != UNUSED, samples - frozen[cell], 0)
+        offset = jnp.where(keys[:, None] != UNUSED, samples - places[cell], 0)
         spread = jax.ops.segment_sum(
             offset[:, :, None] * offset[:, None, :], cell, len(valid)
         )
         normals, spacing = normals_from_neighbours(
-            frozen, valid, count, spread, num_neighbours
+            places, valid, count, spread, num_neighbours
         )
     points = jnp.where(valid[:, None], places + low, 0)
     return PointCloud(points, normals, valid, spacing=spacing)
@@ -76,10 +76,11 @@ def thin(
 def estimate_normals(points: Points, mask: Mask) -> Points:
     """Unit normals of `(n, d)` points from their surroundings; zero where undefined.
 
-    The sign is arbitrary. See `jaxreg.cloud.normals` for the window. Gradients: cut.
+    The sign is arbitrary. See `jaxreg.cloud.normals` for the window, and for what their
+    gradients hold.
     """
     low, size, rows, keys = _cells(points, mask, None)
-    samples = lax.stop_gradient(jnp.where(mask[rows, None], points[rows] - low, 0))
+    samples = jnp.where(mask[rows, None], points[rows] - low, 0)
     normals = normals_from_cells(samples, mask[rows], samples, keys, size, 1)
     return jnp.zeros_like(normals).at[rows].set(normals)
 
@@ -91,9 +92,11 @@ def _cells(
 
     At most `capacity` cells are filled by more points than that; else, the cells are
     half as large as those that hold a few points each.
+
+    Gradients: of corner and size, as the box of the points moves and grows.
     """
-    frozen = lax.stop_gradient(points)
-    low, side = bounding_cube(frozen, mask)
+    moving = bounding_cube(points, mask)
+    frozen, low, side = lax.stop_gradient((points, *moving))
     num = jnp.sum(mask).astype(points.dtype)
     filled = jnp.maximum(num / _POINTS_PER_CELL, 1)
     if capacity is not None:
@@ -101,9 +104,11 @@ def _cells(
     size = cell_size(frozen, mask, low, side, filled)
     fine = jnp.maximum(size / 2, side / 1000)
     if capacity is None:
-        return low, fine, *cells_in_order(frozen, mask, low, fine)
-    size = jnp.where(num > capacity, size, fine)
-    return low, *at_most(capacity, frozen, mask, low, side, size)
+        size, (rows, keys) = fine, cells_in_order(frozen, mask, low, fine)
+    else:
+        size = jnp.where(num > capacity, size, fine)
+        size, rows, keys = at_most(capacity, frozen, mask, low, side, size)
+    return moving[0], size * (moving[1] / side), rows, keys
 
 
 def _cell_numbers(keys: Array) -> Array:

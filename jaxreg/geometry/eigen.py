@@ -4,10 +4,16 @@ In closed form over arrays of entries, which XLA vectorises; a batched `eigh` ca
 LAPACK matrix by matrix and takes a hundred times longer.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+# Eigenvalues that differ by less, in units of rounding and of the largest, coincide.
+_APART = 100
+
+
+@jax.custom_jvp
 def least_eigenvectors(
     entries: Float[Array, "d d n"],
 ) -> tuple[Float[Array, "d n"], Float[Array, " n"], Float[Array, " n"]]:
@@ -19,8 +25,47 @@ def least_eigenvectors(
     Returns:
         Eigenvectors (any unit vector or zero where the least eigenvalue is not
         simple), the second least and the largest eigenvalues (equal in 2D).
+
+    Gradients: of the eigenvectors exact, zero where the least eigenvalue is not simple;
+    the eigenvalues are there to be compared, theirs are cut.
     """
     return _in_plane(entries) if entries.shape[0] == 2 else _in_space(entries)
+
+
+@least_eigenvectors.defjvp
+def _least_eigenvectors_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple:
+    """By n' = -B^+ A' n with B = A - n n^T A n, whose inverse the plane across n has.
+
+    There B has the trace s and the determinant p of A's other eigenvalues less the
+    least, so B^-1 = (s - B) / p (Cayley and Hamilton).
+    """
+    (a,), (da,) = primals, tangents
+    n, second, largest = least_eigenvectors(a)
+    least = _dot(n, _times(a, n))
+    eye = jnp.eye(len(n), dtype=a.dtype)[:, :, None]
+    b = a - least * eye
+    pull = _times(da, n)
+    pull = pull - n * _dot(n, pull)
+    total = jnp.trace(b)
+    if len(n) == 2:
+        turn, determinant = pull, total
+    else:
+        turn = total * pull - _times(b, pull)
+        minors = [b[i, i] * b[j, j] - b[i, j] ** 2 for i, j in ((0, 1), (0, 2), (1, 2))]
+        determinant = minors[0] + minors[1] + minors[2]
+    unit = jnp.maximum(largest, 0) ** (len(n) - 1)
+    apart = determinant > _APART * jnp.finfo(a.dtype).eps * unit
+    turn = jnp.where(apart, -turn / jnp.where(apart, determinant, 1), 0)
+    zero = jnp.zeros_like(second)
+    return (n, second, largest), (turn, zero, zero)
+
+
+def _times(a: Float[Array, "d d n"], x: Float[Array, "d n"]) -> Float[Array, "d n"]:
+    return jnp.stack([_dot(row, x) for row in a])
+
+
+def _dot(x: Float[Array, "d n"], y: Float[Array, "d n"]) -> Float[Array, " n"]:
+    return sum((x[i] * y[i] for i in range(1, len(x))), x[0] * y[0])
 
 
 def _in_plane(a: Array) -> tuple[Array, Array, Array]:

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import spread_rows
 from jaxreg._core.typing import Mask, Points
@@ -18,21 +18,22 @@ def median_spacing(points: Points, mask: Mask) -> Float[Array, ""]:
     fourth on a surface: the nearest one tells little of random samples. Measured from
     64 valid rows spread over the array; duplicates of a point are skipped.
 
-    Gradients: cut.
+    Gradients: of that distance; which points it is between is held.
     """
-    points = lax.stop_gradient(points)
+    columns = lax.stop_gradient(points.T)
     at, use = spread_rows(mask, _SAMPLES)
-    columns = points.T
-    other = lax.map(lambda row: _distance_to_other(points[row], columns, mask), at)
-    use = use & (other > 0)
-    spacing = jnp.nanmedian(jnp.where(use, other, jnp.nan))
+    other = lax.map(lambda row: _other(columns[:, row], columns, mask), at)
+    sq = jnp.sum((points[at] - points[other]) ** 2, axis=1)
+    use = use & (other >= 0) & (sq > 0)
+    distance = jnp.sqrt(jnp.where(use, sq, 1))
+    spacing = jnp.nanmedian(jnp.where(use, distance, jnp.nan))
     return jnp.where(jnp.any(use), spacing, 0)
 
 
-def _distance_to_other(
+def _other(
     query: Float[Array, " d"], columns: Float[Array, "d n"], mask: Mask
-) -> Float[Array, ""]:
-    """Distance to the second (2D) or fourth (3D) nearest other point, or the last."""
+) -> Int[Array, ""]:
+    """The second (2D) or fourth (3D) nearest other point, or the last; -1 if none."""
     d, n = columns.shape
     sq = (columns[0] - query[0]) ** 2
     for axis in range(1, d):
@@ -51,5 +52,4 @@ def _distance_to_other(
         return jnp.where(nearest < far, nearest, last)
 
     last = lax.fori_loop(0, 2 * (d - 1), next_nearest, jnp.full((), -1, bits_type))
-    distance = jnp.sqrt(jnp.sum((query - columns[:, last & row_mask]) ** 2))
-    return jnp.where(last >= 0, distance, 0)
+    return jnp.where(last >= 0, last & row_mask, -1).astype(jnp.int32)

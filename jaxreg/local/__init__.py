@@ -4,6 +4,9 @@ from jaxreg.local.curvature import Curvature as Curvature
 from jaxreg.local.curvature import sandwich as sandwich
 from jaxreg.local.curvature import tangent_unit as tangent_unit
 from jaxreg.local.icp import ICP as ICP
+from jaxreg.local.implicit import AbstractRest as AbstractRest
+from jaxreg.local.implicit import Rest as Rest
+from jaxreg.local.implicit import at_rest as at_rest
 from jaxreg.local.optimiser import LocalOptimiser as LocalOptimiser
 from jaxreg.local.steps import AbstractStep as AbstractStep
 from jaxreg.local.steps import ClosedForm as ClosedForm

@@ -75,15 +75,6 @@ class Limits(eqx.Module):
             return 1
         return max(1, min(_MAX_STRIDE, num_points // _MIN_COARSE_POINTS))
 
-    def within_reach(self, found: Match) -> Match:
-        """The match with the pairs that are too far apart masked."""
-        near = found.sq_residual <= self.farthest**2
-        return eqx.tree_at(
-            lambda m: (m.mask, m.agreement),
-            found,
-            (found.mask & near, jnp.where(near, found.agreement, 0)),
-        )
-
 
 class Descending(AbstractIteration[tuple[Motion, Scalar], Descent]):
     """The steps of a descent, from a pose and a scale.
@@ -126,7 +117,7 @@ class Descending(AbstractIteration[tuple[Motion, Scalar], Descent]):
     def step(self, state: Descent) -> Descent:
         """Matches, weighs, moves."""
         optimiser, limits = self.optimiser, self.limits
-        found = limits.within_reach(self._matched(state))
+        found = self._matched(state).within(limits.farthest)
         width = optimiser.kernel.width_of(found.sq_residual, found.mask)
         width = jnp.maximum(jnp.minimum(width, state.width), limits.floor)
         weight = optimiser.weights(found, width)

@@ -34,7 +34,7 @@ from jaxreg.cloud import (
 from jaxreg.geometry import lie
 from jaxreg.local.curvature import Curvature, is_degenerate
 from jaxreg.local.descent import Descending, Descent, Limits
-from jaxreg.local.implicit import stationary
+from jaxreg.local.implicit import Rest, at_rest
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.scale import first_guess
 from jaxreg.local.steps import AbstractStep, GaussNewton
@@ -188,13 +188,11 @@ class ICP(AbstractRegistrar):
         )
         end = ended.state
         T, scale = end.T, end.scale
-        at_floor = end.width == descending.limits.floor
-        width = jnp.where(at_floor, limits.floor, end.width)
         if isinstance(self.adjoint, ImplicitAdjoint):
-            T, scale = stationary(optimiser, problem, width, limits, end)
+            T, scale = _settled(optimiser, problem, limits, end)
 
         found = match(problem.scaled(end.scale), end.T_matched, end.row)
-        found = limits.within_reach(found)
+        found = found.within(limits.farthest)
         frozen, frozen_found = lax.stop_gradient((problem, found))
         weight = lax.stop_gradient(optimiser.weights(frozen_found, end.width))
         worse = self._worse_than(lax.stop_gradient(end), frozen, frozen_found, limits)
@@ -231,7 +229,7 @@ class ICP(AbstractRegistrar):
     ) -> tuple[Descending, Scalar]:
         """The steps, and the target's sample spacing."""
         spacing = median_spacing(target.points, target.mask)
-        index = self._indexed(target, spacing)
+        index = lax.stop_gradient(self._indexed(target, spacing))
         problem = Problem.of(source, target, index, frames)
         optimiser = LocalOptimiser(self.residual, self.kernel, self.step)
         return Descending(optimiser, problem, self._limits(spacing)), spacing
@@ -268,6 +266,29 @@ class ICP(AbstractRegistrar):
         # error, and a guess is not worth more than an end within that.
         chance = lax.rsqrt(jnp.maximum(jnp.sum(mask), 1).astype(end.width.dtype))
         return loss(end.first_sq_residual[: len(last)]) < (1 - chance) * loss(last)
+
+
+def _settled(
+    optimiser: LocalOptimiser, problem: Problem, limits: Limits, end: Descent
+) -> tuple[Motion, Scalar]:
+    """The pose and scale at the end, with their derivatives."""
+    end = lax.stop_gradient(end)
+    found = match(problem.scaled(end.scale), end.T, end.row).within(limits.farthest)
+    wide = optimiser.kernel.width_of(found.sq_residual, found.mask)
+    follows = (end.width > limits.floor) & (wide > 0)
+    share = jnp.where(follows, end.width / jnp.where(follows, wide, 1), 0)
+    T, scale = at_rest(
+        Rest(
+            optimiser,
+            problem,
+            jnp.where(follows, end.width, limits.floor),
+            end.T,
+            end.row,
+            end.scale if limits.with_scale else None,
+            *lax.stop_gradient((limits.farthest, share)),
+        )
+    )
+    return T, end.scale if scale is None else scale
 
 
 def _evidence(

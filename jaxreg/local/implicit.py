@@ -4,135 +4,116 @@ Where a descent ends, the pulls of the matched points balance: b = 0, with weigh
 the kernel. The pose is differentiated through that equation, not through the loop.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.linear.small import eigh, least_norm_solution
-from jaxreg.local.descent import Descent, Limits
+from jaxreg.geometry import lie
+from jaxreg.linear.balance import AbstractBalance, balanced
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.steps import turn_and_shift
-from jaxreg.local.steps.base import full_matmul
-from jaxreg.matching.problem import Problem, match
+from jaxreg.matching.problem import Match, Problem, match
 
 
-# Singular values below this share of the largest, in units of rounding, are free.
-_FREE = 100
+class AbstractRest(AbstractBalance):
+    """Where a pose came to rest, and a scale if that was free; both are held."""
+
+    T: eqx.AbstractVar[Motion]
+    scale: eqx.AbstractVar[Scalar | None]
+
+    @property
+    def like(self) -> Float[Array, " k"]:
+        """The tangent of the pose, and the logarithm of the scale if that is free."""
+        k = 3 * (len(self.T) - 2) + (self.scale is not None)
+        return jnp.broadcast_to(self.T[0, 0], k)
 
 
-class _End(eqx.Module):
-    """What the balance at the end depends on; `found` is held."""
+class Rest(AbstractRest):
+    """What a descent ended with; derivatives are by the first three.
+
+    Attributes:
+        optimiser: residual, kernel and step; the last has no influence.
+        problem: the pair.
+        width: of the kernel.
+        T: the pose.
+        row: `(n,)` its matches; None: the closest points, found when they are needed.
+        scale: of the source before the pose, if it is free.
+        farthest: pairs farther apart do not count.
+        follows: the width over that which the kernel suggests for the residuals, if it
+            follows these; not above zero: it does not.
+    """
 
     optimiser: LocalOptimiser
     problem: Problem
     width: Scalar
-    limits: Limits
-    found: Descent
+    T: Motion
+    row: Int[Array, " n"] | None = None
+    scale: Scalar | None = None
+    farthest: Scalar | None = None
+    follows: Scalar | None = None
+
+    def ready(self) -> "Rest":
+        """With the matches at the pose, where they are not known."""
+        if self.row is not None:
+            return self
+        found = match(*jax.lax.stop_gradient((self.problem, self.T)))
+        return dataclasses.replace(self, row=found.row)
+
+    def pulls(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
+        """b, and the pull on the scale if that is free."""
+        found, weight = self._weighed(x)
+        residual = self.optimiser.residual
+        b = jnp.sum(weight * residual.descents(found), axis=1)
+        if self.scale is None:
+            return b
+
+        def energy(s: Array) -> Array:
+            grown = dataclasses.replace(
+                found, residual=found.residual - s * found.rotated
+            )
+            return residual.energy(grown, weight)
+
+        zero, one = jnp.zeros_like(self.width), jnp.ones_like(self.width)
+        slope = jax.jvp(energy, (zero,), (one,))[1]
+        return jnp.concatenate([b, -slope[None]])
+
+    def _weighed(self, x: Float[Array, " k"]) -> tuple[Match, Float[Array, " n"]]:
+        """The same matches at a tangent from the pose, and their weights there."""
+        T, scale = _moved(self.T, self.scale, x)
+        problem = self.problem if scale is None else self.problem.scaled(scale)
+        found = match(problem, T, self.row)
+        if self.farthest is not None:
+            found = found.within(self.farthest)
+        return found, self.optimiser.weights(found, self._width(found))
+
+    def _width(self, found: Match) -> Scalar:
+        """The width, where it follows the residuals with their derivatives."""
+        if self.follows is None:
+            return self.width
+        # Residuals of zero have no finite slope.
+        sq = jnp.where(self.follows > 0, found.sq_residual, 1)
+        width = self.optimiser.kernel.width_of(sq, found.mask)
+        return jnp.where(self.follows > 0, self.follows * width, self.width)
 
 
-def stationary(
-    optimiser: LocalOptimiser,
-    problem: Problem,
-    width: Scalar,
-    limits: Limits,
-    end: Descent,
-) -> tuple[Motion, Scalar]:
-    """`end.T` and `end.scale`, with the derivatives of the pose that balances.
-
-    Args:
-        optimiser: residual, kernel and step; the first two may be differentiated.
-        problem: the pair, of which source and target may be.
-        width: kernel width at the end, which may be.
-        limits: those of the descent.
-        end: where it ended; the correspondences are its rows.
-    """
-    end = jax.lax.stop_gradient(end)
-    x = _correction(_End(optimiser, problem, width, limits, end))
-    k = x.shape[0] - limits.with_scale
-    T = turn_and_shift(end.T, x[:k])
-    return T, end.scale * jnp.exp(x[k]) if limits.with_scale else end.scale
+def at_rest(end: AbstractRest) -> tuple[Motion, Scalar | None]:
+    """The pose and the scale, with the derivatives of those at which pulls balance."""
+    T, scale = end.T, end.scale
+    # A pose that is not a number pulls nothing.
+    known = jnp.all(jnp.isfinite(T))
+    still = jnp.where(known, T, lie.identity(len(T) - 1, T.dtype))
+    x = balanced(dataclasses.replace(end, T=still))
+    return _moved(T, scale, jnp.where(known, x, 0))
 
 
-@eqx.filter_custom_jvp
-def _correction(at: _End) -> Float[Array, " k"]:
-    """The tangent from the end to the balance: zero, with derivatives."""
-    d = at.problem.source.shape[0]
-    k = 3 * (d - 1) + at.limits.with_scale
-    zero = jnp.zeros(k, at.problem.source.dtype)
-    # A constant has no lanes under `vmap`, but its tangent has: JAX mixes them up.
-    return jnp.where(jnp.isnan(at.found.T[0, 0]), -zero, zero)
-
-
-@_correction.def_jvp
-def _correction_jvp(primals: tuple[_End], tangents: tuple) -> tuple[Array, Array]:
-    (at,), zero = primals, _correction(*primals)
-    along = eqx.filter_jvp(lambda at: _pulls(zero, at), primals, tangents)[1]
-    if along is None:  # nothing that is differentiated has an influence
-        return zero, jnp.zeros_like(zero)
-    A = jax.jacfwd(lambda x: _pulls(x, at))(zero)
-    # Directions that the data leave free do not follow.
-    return zero, -least_norm_solution(A, along, _FREE * float(jnp.finfo(A.dtype).eps))
-
-
-def _with_turning_normals(problem: Problem) -> Problem:
-    """Normals that turn with their cloud as a whole, each held within it.
-
-    So the pose follows a rigid motion of either cloud exactly.
-    """
-    d = problem.source.shape[0]
-    source = _turned(problem.source, problem.source_normals)
-    points, normals = problem.target[:, :d].T, problem.target[:, d:].T
-    target = jnp.concatenate([points, _turned(points, normals)]).T
-    return eqx.tree_at(
-        lambda p: (p.source_normals, p.target), problem, (source, target)
-    )
-
-
-def _turned(
-    points: Float[Array, "d n"], normals: Float[Array, "d n"]
-) -> Float[Array, "d n"]:
-    """The same normals, with the derivative of the rotation that fits the points'.
-
-    Its tangent W is skew and least in sum |dx - W x|^2: W C + C W = B - B^T with
-    C = sum x x^T and B = sum dx x^T.
-    """
-    still = jax.lax.stop_gradient(points)
-    known = jnp.any(normals != 0, axis=0).astype(points.dtype)
-    middle = jnp.sum(known * still, axis=1) / jnp.maximum(jnp.sum(known), 1)
-    x = known * (still - middle[:, None])
-    B = full_matmul(points - still, x.T)
-    spread, axes = eigh(full_matmul(x, x.T))
-    skew = full_matmul(axes.T, full_matmul(B - B.T, axes))
-    total = spread[:, None] + spread[None, :]
-    floor = _FREE * jnp.finfo(spread.dtype).eps * spread[-1]
-    skew = jnp.where(total > floor, skew / jnp.where(total > floor, total, 1), 0)
-    turn = full_matmul(axes, full_matmul(skew, axes.T))
-    return normals + full_matmul(turn, normals)
-
-
-def _pulls(x: Float[Array, " k"], at: _End) -> Float[Array, " k"]:
-    """b, and the pull on the scale if that is free, at a tangent from the end."""
-    d = at.problem.source.shape[0]
-    T = turn_and_shift(at.found.T, x[: 3 * (d - 1)])
-    scale = at.found.scale
-    if at.limits.with_scale:
-        scale = scale * jnp.exp(x[-1])
-    found = match(_with_turning_normals(at.problem).scaled(scale), T, at.found.row)
-    found = at.limits.within_reach(found)
-    weight = at.optimiser.weights(found, at.width)
-    residual = at.optimiser.residual
-    b = jnp.sum(weight * residual.descents(found), axis=1)
-    if not at.limits.with_scale:
-        return b
-
-    def energy(s: Array) -> Array:
-        grown = eqx.tree_at(
-            lambda m: m.residual, found, found.residual - s * found.rotated
-        )
-        return residual.energy(grown, weight)
-
-    zero, one = jnp.zeros_like(at.width), jnp.ones_like(at.width)
-    slope = jax.jvp(energy, (zero,), (one,))[1]
-    return jnp.concatenate([b, -slope[None]])
+def _moved(
+    T: Motion, scale: Scalar | None, x: Float[Array, " k"]
+) -> tuple[Motion, Scalar | None]:
+    """Pose and scale at a tangent."""
+    if scale is None:
+        return turn_and_shift(T, x), None
+    return turn_and_shift(T, x[:-1]), scale * jnp.exp(x[-1])

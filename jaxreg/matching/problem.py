@@ -124,6 +124,15 @@ class Match(eqx.Module):
         """Signed distance to the target's tangent plane (line in 2D)."""
         return sum_rows(self.normal * self.residual)
 
+    def within(self, distance: Scalar) -> "Match":
+        """With the pairs that are farther apart masked."""
+        near = self.sq_residual <= distance**2
+        return eqx.tree_at(
+            lambda m: (m.mask, m.agreement),
+            self,
+            (self.mask & near, jnp.where(near, self.agreement, 0)),
+        )
+
 
 def sum_rows(x: Float[Array, "d n"]) -> Float[Array, " n"]:
     """Sum over the d coordinates, unrolled: faster than a reduction of length 3."""

@@ -197,22 +197,22 @@ class AbstractSearch(AbstractIndexedRegistrar):
         key: Key | None,
     ) -> RegistrationSolution:
         """`solve` with indexes built before, for clouds that enter many pairs."""
-        # Nothing is differentiated: the loops of a search know no reverse mode.
-        self, source, target, init = lax.stop_gradient(
-            (cast_floats(self, source.points.dtype), source, target, init)
-        )
+        # The search is not differentiated, its loops know no reverse mode; the answer
+        # is, by what its last steps depend on.
+        moving = cast_floats(self, source.points.dtype)
+        moving_pair = Pair(source, target, source_index, target_index)
+        self, pair, init = lax.stop_gradient((moving, moving_pair, init))
         key_points, key_search = jax.random.split(check_key(key))
-        pair = Pair(source, target, source_index, target_index)
         few = _some_points(key_points, pair.problem, self.num_points)
         found = self.search(key_search, few, init)
         solution = conclude(
-            pair,
+            moving_pair,
             found.particles,
             found.num_steps,
             found.finished,
             self._proposals(pair, found.sure, init),
             None if self.prior is None else self.prior.log_density,
-            kernel=self.kernel,
+            kernel=moving.kernel,
             num_modes=self.num_modes,
             refine_steps=self.refine_steps,
             min_log_evidence=self.min_log_evidence,

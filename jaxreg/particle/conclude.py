@@ -9,14 +9,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.adjoint import refusing
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.local import Curvature
-from jaxreg.matching import NO_EVIDENCE, Evidence
-from jaxreg.particle.last_digits import last_digits
+from jaxreg.local import Curvature, at_rest
+from jaxreg.matching import NO_EVIDENCE, Evidence, Problem
+from jaxreg.particle.last_digits import LastRest, last_digits
 from jaxreg.particle.modes import distinct_modes, first_within
 from jaxreg.particle.pair import Pair
-from jaxreg.particle.refine import polished, refined
+from jaxreg.particle.refine import followed, polished, polishing, refined
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import Modes, RegistrationSolution
 from jaxreg.robust import AbstractKernel
@@ -36,6 +37,12 @@ _HOPELESS = 6.0
 _MOST_EVIDENCE = 10.0
 # Steps of the most accurate residual, where it is close already.
 _POLISH = 8
+
+
+_UNREFINED = (
+    "Without refinement (refine_steps=0) the answer is a particle, which no equation "
+    "holds: it has no derivative. Refine it, or register by ICP() from it."
+)
 
 
 #: What is known of a pose beforehand, in the frames of the search.
@@ -58,27 +65,32 @@ def conclude(
     """The solution of a search.
 
     Args:
-        pair: what was searched.
+        pair: what was searched, with the derivatives that poses are to follow.
         particles: measured and weighted poses.
         num_steps: steps of the local optimiser that led to them.
         finished: whether they had come to rest.
         proposals: more poses to refine and judge, and which are in use; they count
             where surfaces hold them and a seventh of the source is shared.
         log_prior: of a pose, added to its log evidence.
-        kernel: of the refinement.
+        kernel: of the refinement, likewise.
         num_modes: distinct poses of the particles to refine and judge; of these and the
             proposals the solution has as many.
         refine_steps: steps on all points; the modes are then ordered by their
             evidence. Without, by energy: the answer is the particle of least energy.
         min_log_evidence: of less the status is LOW_OVERLAP.
     """
-    refines = refine_steps > 0
+    refines, moving = refine_steps > 0, (pair, kernel)
+    pair, kernel = lax.stop_gradient(moving)
     poses = _candidates(particles, num_modes, proposals, log_prior)
     exact = pair.exact
     found = _judged(pair, exact, kernel, poses, num_modes, refine_steps, log_prior)
     mass = _weights(found.log_evidence, found.sound) if refines else found.mass
     enough = found.log_evidence[0] >= min_log_evidence
     T_modes, curvatures = _accurate(pair, exact, kernel, found, enough, refines)
+    if refines:
+        T_modes = _followed(*moving, exact, T_modes, found.sound, enough)
+    else:
+        T_modes = refusing(T_modes, moving, _UNREFINED)
     evidence, holds = found.evidence, found.evidence.grip.holds
     doubtful = ~holds[0] | _has_rival(found.log_evidence, holds)
     status = _status(found.sound[0], enough, doubtful, pair, finished | refines)
@@ -199,6 +211,24 @@ def _accurate(
         first,
     )
     return jax.tree.map(lambda x, y: x.at[0].set(y), every, last)
+
+
+def _followed(
+    pair: Pair,
+    kernel: AbstractKernel,
+    exact: Pair,
+    T: Float[Array, "q D D"],
+    sound: Bool[Array, " q"],
+    enough: Bool[Array, ""],
+) -> Float[Array, "q D D"]:
+    """The poses with the derivatives of the balance at their last steps."""
+    width = 0.5 * pair.spacing
+    problem = Problem.of(pair.source, pair.target, exact.target_index)
+    every = followed(polishing(kernel, T.dtype), problem, width, T, sound)
+    if pair.source.fine is None:
+        return every
+    first = at_rest(LastRest(pair, kernel, width, T[0]))[0]
+    return every.at[0].set(jnp.where(sound[0] & enough, first, every[0]))
 
 
 def _convincing(evidence: Evidence) -> Bool[Array, " q"]:

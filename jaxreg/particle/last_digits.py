@@ -1,12 +1,19 @@
 """The last digits of a believed pose, from all points or four times as many."""
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
-from jaxreg.local import Curvature, GaussNewton, LocalOptimiser
-from jaxreg.matching import Symmetric, match
+from jaxreg.local import (
+    AbstractRest,
+    Curvature,
+    GaussNewton,
+    LocalOptimiser,
+    Rest,
+)
+from jaxreg.matching import Problem, Symmetric, match
 from jaxreg.particle.pair import Pair
 from jaxreg.robust import AbstractKernel
 
@@ -32,12 +39,37 @@ def last_digits(
         T_target_source: the pose.
         width: of the kernel in the first step.
     """
-    fine = pair.fine
-    optimiser = LocalOptimiser(Symmetric(), kernel, GaussNewton())
-    optimiser, problem = cast_floats(optimiser, width.dtype), fine.problem
-    end = jnp.minimum(_WIDTH * fine.spacing, width)
+    optimiser, problem, end = _last(pair, kernel, width)
     fall = jnp.geomspace(width, end, _STEPS // 3, dtype=width.dtype)
     widths = jnp.concatenate([fall, jnp.full(_STEPS - len(fall), end)])
     T = lie.orthonormalise(optimiser.repeat(problem, T_target_source, widths))
     found = match(problem, T)
     return T, Curvature.of(optimiser, problem, T, found, end)
+
+
+class LastRest(AbstractRest):
+    """Where `last_digits` of a pair came to rest; for `at_rest`."""
+
+    pair: Pair
+    kernel: AbstractKernel
+    width: Scalar
+    T: Motion
+    scale: None = None
+
+    def ready(self) -> Rest:
+        """With the finest clouds and their indexes."""
+        return Rest(*_last(self.pair, self.kernel, self.width), self.T).ready()
+
+    def pulls(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
+        """Those of `ready`."""
+        return self.ready().pulls(x)
+
+
+def _last(
+    pair: Pair, kernel: AbstractKernel, width: Scalar
+) -> tuple[LocalOptimiser, Problem, Scalar]:
+    """What the last steps are by, on what, and how wide the kernel ends."""
+    fine = pair.fine
+    optimiser = LocalOptimiser(Symmetric(), kernel, GaussNewton())
+    end = jnp.minimum(_WIDTH * fine.spacing, width)
+    return cast_floats(optimiser, width.dtype), fine.problem, end

@@ -1,7 +1,7 @@
 """What is done to poses before and after they are judged: many steps on all points."""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
-from jaxreg.local import Curvature, GaussNewton, LocalOptimiser
+from jaxreg.local import Curvature, GaussNewton, LocalOptimiser, Rest, at_rest
 from jaxreg.matching import PlaneToPlane, PointToPlane, Problem, match
 from jaxreg.robust import AbstractKernel
 
@@ -55,8 +55,7 @@ def polished(
     before, as wrong ones gain more by it than right ones. What is no mode stays, and so
     do those without hope, which have a curvature only.
     """
-    optimiser = LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton())
-    optimiser = cast_floats(optimiser, T.dtype)
+    optimiser = polishing(kernel, T.dtype)
 
     def polish(T: Motion) -> Motion:
         return lie.orthonormalise(
@@ -69,6 +68,32 @@ def polished(
     polished = _of_used(polish, T, sound & hopeful)
     T = jnp.where((sound & hopeful)[:, None, None], polished, T)
     return T, _of_used(curvature_at, T, sound)
+
+
+def polishing(kernel: AbstractKernel, dtype: Any) -> LocalOptimiser:
+    """What `polished` steps by."""
+    optimiser = LocalOptimiser(PlaneToPlane(0.01), kernel, GaussNewton())
+    return cast_floats(optimiser, dtype)
+
+
+def followed(
+    optimiser: LocalOptimiser,
+    problem: Problem,
+    width: Scalar,
+    T: Float[Array, "q D D"],
+    used: Bool[Array, " q"],
+) -> Float[Array, "q D D"]:
+    """The same poses, those in use with the derivatives of the balance near by."""
+
+    def one(mode: tuple[Motion, Bool[Array, ""]]) -> Motion:
+        return lax.cond(
+            mode[1],
+            lambda T: at_rest(Rest(optimiser, problem, width, T))[0],
+            lambda T: T,
+            mode[0],
+        )
+
+    return lax.map(one, (T, used))
 
 
 def _of_used(
