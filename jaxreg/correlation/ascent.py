@@ -21,7 +21,7 @@ from jaxreg.cloud import PointCloud
 from jaxreg.correlation.quadratic import Quadratic
 from jaxreg.geometry import lie
 from jaxreg.linear.small import eigh
-from jaxreg.local import turn_and_shift
+from jaxreg.local import AbstractRest, turn_and_shift
 
 
 _FIRST_DAMPING = 0.1
@@ -53,7 +53,7 @@ class Ascent(eqx.Module):
 class Ascending(AbstractIteration[Motion, Ascent]):
     """Steps until one is smaller than `tolerance`; the correlation never falls.
 
-    Gradients: none; see `newton_step`.
+    Gradients: none; see `Maximum`.
     """
 
     source: PointCloud
@@ -108,21 +108,40 @@ class Ascending(AbstractIteration[Motion, Ascent]):
         return Quadratic.at(T, self.source, self.target, self.bandwidth)
 
 
-def newton_step(model: Quadratic, b: Float[Array, " k"]) -> Float[Array, " k"]:
-    """The undamped step H^-1 b; free directions are left alone.
+class Maximum(AbstractRest):
+    """Where an ascent ended, for `at_rest`: the pulls of all pairs balance.
 
-    At a maximum with H held, its derivative with respect to what b depends on is that
-    of the maximiser (implicit function theorem).
-
-    Args:
-        model: gives H.
-        b: `(k,)` the model's own, with the derivative that the step is to carry.
+    Derivatives are by clouds and bandwidth.
     """
-    curvature, vector, unit = _principal(model)
-    held = curvature > _FREE
-    along = jnp.sum(vector * (unit * b)[:, None], axis=0)
-    along = jnp.where(held, along / jnp.where(held, curvature, 1), 0)
-    return unit * jnp.sum(vector * along, axis=1)
+
+    source: PointCloud
+    target: PointCloud
+    bandwidth: Scalar
+    T: Motion
+    scale: None = None
+
+    def ready(self) -> "Maximum":
+        """As it is."""
+        return self
+
+    def pulls(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
+        """Of all pairs, at a tangent from the pose."""
+        return self._model(x).b
+
+    def solve(self, x: Float[Array, " k"], b: Float[Array, " k"]) -> Float[Array, " k"]:
+        """By the exact Hessian, which costs no further pass over the pairs.
+
+        Directions in which the correlation is free, or rises, get nothing.
+        """
+        curvature, vector, unit = _principal(self._model(x))
+        held = curvature > _FREE
+        along = jnp.sum(vector * (unit * b)[:, None], axis=0)
+        along = jnp.where(held, along / jnp.where(held, curvature, 1), 0)
+        return -unit * jnp.sum(vector * along, axis=1)
+
+    def _model(self, x: Float[Array, " k"]) -> Quadratic:
+        T = turn_and_shift(self.T, x)
+        return Quadratic.at(T, self.source, self.target, self.bandwidth)
 
 
 def is_free(model: Quadratic) -> Bool[Array, ""]:

@@ -11,10 +11,10 @@ from jaxreg._core.loop import iterate
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points
 from jaxreg.cloud import PointCloud, median_spacing, thin, without_noise
-from jaxreg.correlation.ascent import Ascending, is_free, newton_step
+from jaxreg.correlation.ascent import Ascending, Maximum, is_free
 from jaxreg.correlation.quadratic import Quadratic, pull_on_target
 from jaxreg.geometry import lie
-from jaxreg.local import sandwich, turn_and_shift
+from jaxreg.local import at_rest, sandwich
 from jaxreg.matching import Witness
 from jaxreg.registrar import AbstractRegistrar, Frames, Modes, RegistrationSolution
 
@@ -58,9 +58,10 @@ class KernelCorrelation(AbstractRegistrar):
     DEGENERATE where the correlation leaves a direction free (a ring, a sphere).
 
     Gradients: of the pose with respect to both clouds and the bandwidth, exact by the
-    implicit function theorem at the maximum, in O(n + m) memory; zero in free
-    directions and where the steps ran out. Thinning passes them on through its means.
-    The other fields are cut, and nothing flows to `init`.
+    implicit function theorem at the maximum, in O(n + m) memory, in forward and reverse
+    mode and of any order; free directions do not follow. The default bandwidth follows
+    the spacing that it is taken from, and thinned points the means that they are;
+    which points are merged is held. Nothing flows to `init`; the other fields are cut.
 
     Reference: Tsin and Kanade, ECCV 2004. The steps are ours, see
     `jaxreg.correlation.ascent` for why.
@@ -112,10 +113,8 @@ class KernelCorrelation(AbstractRegistrar):
         ended = iterate(ascending, ascending.init(fixed[2]), max_steps=self.max_steps)
         end = ended.state
 
-        model = Quadratic.at(end.T, source, target, width)
-        held = lax.stop_gradient(model)
-        T = turn_and_shift(end.T, newton_step(held, model.b))
-        T = jnp.where(ended.converged, T, end.T)
+        held = Quadratic.at(end.T, *fixed[:2], fixed[3])
+        T = at_rest(Maximum(source, target, width, end.T))[0]
 
         evidence = Witness.of_some(*fixed[:2]).of_pose(lax.stop_gradient(T))
         status = jnp.where(is_free(held), Status.DEGENERATE, ended.status)

@@ -106,7 +106,7 @@ def test_a_descent_limited_to_near_pairs_is_that_of_the_near_points(near, residu
 
     @jax.jit
     def pulls(problem):
-        found = limits.within_reach(match(problem, T))
+        found = match(problem, T).within(limits.farthest)
         return residual.normal_equations(found, optimiser.weights(found, limits.floor))
 
     for found, expected in zip(*map(pulls, problems), strict=True):
