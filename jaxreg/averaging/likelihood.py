@@ -53,7 +53,7 @@ DEVIATIONS = tuple(0.5 / 2**k for k in range(8))
 # motions (`bench/studies/averaging_objective.md`, the half to choose on): 0.6 to 0.8.
 _DIMENSION = 0.8
 # Log odds that p may have: from 1 to 99 %, of near views one half at least.
-_LOG_ODDS, _EVEN = (-4.5, -3.0, -1.5, 0.0, 1.5, 3.0, 4.5), 3
+_LOG_ODDS = (-4.5, -3.0, -1.5, 0.0, 1.5, 3.0, 4.5)
 #: Poses that agree with more than this share of believed edges need no search: noise
 #: leaves out about one of a hundred right ones.
 SETTLED = 0.98
@@ -166,8 +166,7 @@ def _explained(
     bound = jnp.asarray((*_NEAREST, jnp.iinfo(rank.dtype).max))[:, None]
     is_near = (rank < bound).astype(sq.dtype)  # (t + 1, e)
     band = jnp.diff(is_near, axis=0, prepend=0)
-    number = jnp.arange(len(_LOG_ODDS))
-    allowed = (number[:, None] >= number) & (number[:, None] >= _EVEN)  # near, far
+    allowed = log_odds[:, None] >= jnp.maximum(log_odds, 0)  # near, far
     free, reach = num_held(graph) - 1, _reach(graph.dim)
 
     def log_gain(deviation: Array) -> tuple[Array, Array]:

@@ -19,9 +19,8 @@ from jaxreg.batching.progress import tell
 from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
 
 
-# The least sizes that graphs are padded to.
-_LEAST_POSES, _LEAST_EDGES = 8, 16
-_STAGE = "averaging graphs"
+# The least number of poses that graphs are padded to, and half that of edges.
+_LEAST = 8
 # Graphs in one call of a compiled program, at most, unless more are side by side.
 _PIECE = 64
 
@@ -50,7 +49,8 @@ def average_list(
     inits = _check_inits(init, checked)
     keys = None if key is None else jax.random.split(key, len(checked))
     out: dict[int, AveragingSolution] = {}
-    tell(progress, _STAGE, 0, len(checked), checked, inits, keys)
+    stage = "averaging graphs"
+    tell(progress, stage, 0, len(checked), checked, inits, keys)
     for rows, padded_to in _pieces(checked, batch_size):
         some = [checked[k] for k in rows]
         starts = None if inits is None else [inits[k] for k in rows]
@@ -60,7 +60,7 @@ def average_list(
         if is_concrete(found.status):
             found = jax.tree.map(np.asarray, found)  # slices compile nothing
         out |= {k: _cut(found, lane, checked[k]) for lane, k in enumerate(rows)}
-        tell(progress, _STAGE, len(out), len(checked), found)
+        tell(progress, stage, len(out), len(checked), found)
     return [out[k] for k in range(len(checked))]
 
 
@@ -71,10 +71,10 @@ def _pieces(
 
     Of one size all pieces have as many, the last one some of the one before.
     """
-    sizes = np.array([rounded_up(g.num_poses, _LEAST_POSES) for g in graphs])
+    sizes = np.array([rounded_up(g.num_poses, _LEAST) for g in graphs])
     for num_poses in np.unique(sizes):
         rows = np.flatnonzero(sizes == num_poses)
-        num_edges = rounded_up(max(graphs[k].num_edges for k in rows), _LEAST_EDGES)
+        num_edges = rounded_up(max(graphs[k].num_edges for k in rows), 2 * _LEAST)
         piece = -(-len(rows) // -(-len(rows) // max(_PIECE, batch_size)))
         for start in range(0, len(rows), piece):
             first = min(start, len(rows) - piece)

@@ -35,10 +35,9 @@ def naive_log_odds(X, edges, T, neutral) -> np.ndarray:
     length = np.linalg.norm(T[:, :3, 3], axis=1)
     low, high = np.sort(length)[[round(0.25 * (H - 1)), round(0.75 * (H - 1))]]
     scale = length[(length >= low) & (length <= high)].mean()
-    prior = np.log(0.4 / 0.6)
-    odds = np.full(H, prior)
+    odds = np.zeros(H)
     for _ in range(6):
-        belief, new = 1 / (1 + np.exp(-odds)), np.full(H, prior)
+        belief, new = 1 / (1 + np.exp(-odds)), np.zeros(H)
         for e, (i, j) in enumerate(edges.tolist()):
             for k in range(len(X)):
                 if (i, k) in at and (k, j) in at:

@@ -15,6 +15,7 @@ from jaxreg._core.checks import check_counts, check_not_negative, check_parts
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.likelihood import (
+    DEVIATIONS,
     explained,
     least_after_fitting,
     log_evidence,
@@ -39,10 +40,6 @@ from jaxreg.averaging.steps.rows import RootRows
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import along_frames
 from jaxreg.linear.laplacian import DENSE_LIMIT
-
-
-# Widths that are tried at most: down to an eighth of the first.
-_WIDTHS = 4
 
 
 class Correntropy(AbstractAverager):
@@ -126,7 +123,7 @@ class Correntropy(AbstractAverager):
         blank = jax.eval_shape(lambda: self._from_width(fixed, T, width))
         blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
         _, _, end = jax.lax.while_loop(
-            lambda tried: (tried[1] < least) & (tried[0] < _WIDTHS),
+            lambda tried: (tried[1] < least) & (tried[0] < len(DEVIATIONS)),
             narrower,
             (jnp.asarray(0, jnp.int32), jnp.full_like(least, -jnp.inf), blank),
         )

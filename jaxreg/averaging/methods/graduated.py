@@ -11,9 +11,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg.averaging.likelihood import SETTLED, agreed_share, explained
+from jaxreg._core.loop import AbstractIteration, iterate
+from jaxreg.averaging.likelihood import (
+    SETTLED,
+    agreed_share,
+    explained,
+    squared_errors,
+)
 from jaxreg.averaging.measures import (
     length_scale,
     nearest_rank,
@@ -23,7 +29,12 @@ from jaxreg.averaging.measures import (
 from jaxreg.averaging.steps.edge_errors import LogError
 from jaxreg.averaging.steps.gauss_newton import gauss_newton_gradients, precisions
 from jaxreg.averaging.steps.iterate import Iterated, pose_change
-from jaxreg.averaging.steps.kernel_width import CHI2_MEDIAN
+from jaxreg.averaging.steps.kernel_width import (
+    chi2_median,
+    middle_variances,
+    spare_factor,
+    variance_inside,
+)
 from jaxreg.averaging.steps.levenberg_marquardt import (
     Minimum,
     Problem,
@@ -38,36 +49,12 @@ from jaxreg.robust import Welsch
 
 
 # The last width in deviations: right edges lose nothing, and the wrong ones of large
-# graphs are far beyond. The first width in deviations, of starts that have spread.
-_DEVIATIONS, _FIRST = 10.0, 40.0
-_COARSE, _FINE = 1e-3, 1e-6
-_ROUNDS = 24
-# The next width is the last one where it is no narrower than this share.
-_SAME = 0.9
-# Wide enough to be none.
-_NO_KERNEL = 1e6
-# The first width of chained starts: so many times the error at this quantile of the
-# edges that do not hold, where lone closures are doubted and where none are.
-_SIFTED, _UNSIFTED = (4.0, 0.98), (2.0, 0.25)
-# Edges with more trust than this are inside.
-_INSIDE = 0.05
-
-
-class _State(NamedTuple):
-    found: Minimum
-    parts: Array  # (2,) deviations of a translation and a rotation
-    width: Array  # of this minimisation
-    next_width: Array
-    round: Array
-    done: Array
-    rows: Array  # of the trace
-
-
-class _Best(NamedTuple):
-    end: _State
-    score: Array
-    tried: Array
-    settled: Array
+# graphs are far beyond.
+_DEVIATIONS = 10.0
+# The first width, over the last one or over the drift that a start shows.
+_WIDER = 4.0
+# Share of the objective that the last minimisation may leave; those before, its root.
+_LEFT = 1e-6
 
 
 def graduated(
@@ -87,51 +74,27 @@ def graduated(
     Gradients: implicit at the fixed point, widths are cut.
     """
     fixed, near, starts = jax.lax.stop_gradient((graph, near, starts))
-    believed = (fixed.weight > 0) & (near.weight == fixed.weight)
-    certain = eqx.tree_at(
-        lambda g: g.weight, fixed, jnp.where(believed, fixed.weight, 0)
-    )
     doubt = near.weight / jnp.where(fixed.weight > 0, fixed.weight, 1)
-
-    def attempt(b: _Best) -> _Best:
-        every = b.tried == starts.shape[0]
-        T_start = jnp.where(every, b.end.found.T, starts[b.tried])
-        end = _narrowed(fixed, doubt, T_start, every, max_steps)
-        score = explained(fixed, end.found.T).log_ratio
-        steps = b.end.found.step + end.found.step
-        better = score > b.score
-        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, b.end)
-        best = best._replace(found=best.found._replace(step=steps))
-        return _Best(
-            best,
-            jnp.maximum(score, b.score),
-            b.tried + 1,
-            agreed_share(certain, end.found.T) > SETTLED,
-        )
-
-    begin = _Best(
-        _before(fixed, doubt, starts[0], jnp.asarray(False)),
-        -jnp.full((), jnp.inf, starts.dtype),
-        jnp.asarray(0, jnp.int32),
-        jnp.asarray(False),
-    )
-    end = jax.lax.while_loop(
-        lambda b: (b.tried <= starts.shape[0]) & ~b.settled, attempt, begin
-    ).end
+    attempts = _Attempts(_Narrowing(fixed, doubt, max_steps), starts)
+    begin = attempts.init(starts[0])
+    end = iterate(attempts, begin, max_steps=len(starts) + 1).state.end
+    trust_of = eqx.Partial(_trust, end.parts, end.width)
     result = Iterated(
         end.found.T,
-        _trust_at(end, fixed, end.found.T),
+        trust_of(fixed, end.found.T),
         _DEVIATIONS * end.parts,
         end.found.converged,
         end.found.step,
-        AveragingTrace.of(end.rows, end.round),
+        AveragingTrace.of(end.rows, end.num_steps),
     )
-    return gauss_newton_gradients(graph, result, eqx.Partial(_trust_at, end))
+    return gauss_newton_gradients(graph, result, trust_of)
 
 
-def _trust_at(state: _State, graph: PoseGraph, T: Array, _: object = None) -> Array:
-    """Of each edge at the widths of a state."""
-    now = _problem(graph, state.parts, state.width)
+def _trust(
+    parts: Array, width: Array, graph: PoseGraph, T: Array, _: object = None
+) -> Float[Array, " e"]:
+    """Of each edge under a kernel."""
+    now = _problem(graph, parts, width)
     return now.trust(now.squares(T))
 
 
@@ -145,120 +108,178 @@ def _problem(
     )
 
 
-def _before(graph: PoseGraph, doubt: Array, T_start: Array, every: Array) -> _State:
-    """Nothing minimised yet; the first width is the last if every edge is to count."""
-    parts = _parts(graph, T_start, jnp.ones_like(graph.weight))
-    squares = _problem(graph, parts, jnp.ones_like(parts[0])).squares(T_start)
-    width = _first_width(graph, doubt == 1, T_start, squares)
-    width = jnp.where(every, _NO_KERNEL, width)
-    none = jnp.asarray(0, jnp.int32)
-    cycle = no_cycle(_problem(graph, parts, width), T_start)
-    start = Minimum(T_start, jnp.asarray(False), none, cycle, None)
-    before = jnp.where(every, width, jnp.inf)
-    rows, no = no_rows(_ROUNDS + 1, T_start.dtype), jnp.asarray(False)
-    return _State(start, parts, before, width, none, no, rows)
+class _State(NamedTuple):
+    found: Minimum
+    parts: Array  # (2,) deviations of a translation and a rotation
+    width: Array  # of this minimisation
+    next_width: Array
+    num_steps: Int[Array, ""]  # widths
+    done: Bool[Array, ""]
+    rows: Array  # of the trace
 
 
-def _narrowed(
-    graph: PoseGraph, doubt: Array, T_start: Array, every: Array, max_steps: int
-) -> _State:
+class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
     """Minimises under narrower kernels until the edges inside fill the kernel.
 
-    Then once more with all edges, to the end; at once and without a kernel if `every`
-    edge is to count.
+    Then once more with all edges, to the end; at once and without a kernel if every
+    edge is to count. What edges count before the end is in `doubt`.
     """
 
-    def turn(s: _State) -> _State:
-        last = (s.next_width > _SAME * s.width) | (s.round == _ROUNDS)
-        now = _problem(graph, s.parts, s.next_width, jnp.where(last, 1, doubt))
-        least = jnp.where(last, _FINE, _COARSE)
-        new = minimise(now, s.found.T, max_steps, least, s.found.cycle)
+    graph: PoseGraph
+    doubt: Float[Array, " e"]
+    max_steps: int  # of a minimisation
+
+    @property
+    def most(self) -> int:
+        """Widths at most: as many as a float has halvings, and the last."""
+        return int(jnp.finfo(self.doubt.dtype).nmant) + 1
+
+    @property
+    def believed(self) -> Bool[Array, " e"]:
+        """Edges that count fully."""
+        return (self.graph.weight > 0) & (self.doubt == 1)
+
+    def init(self, start: tuple[Array, Array]) -> _State:
+        """Nothing minimised yet, from poses, and whether every edge is to count."""
+        T, every = start
+        graph, one = self.graph, jnp.ones_like(self.doubt)
+        parts = self._parts(T, one)
+        width = self._first_width(T, _problem(graph, parts, one[0]).squares(T))
+        # Wide enough to be none, and its square is finite.
+        width = jnp.where(every, jnp.finfo(width.dtype).max ** 0.25, width)
+        none, no = jnp.asarray(0, jnp.int32), jnp.asarray(False)
+        cycle = no_cycle(_problem(graph, parts, width), T)
+        return _State(
+            found=Minimum(T, no, none, cycle, None),
+            parts=parts,
+            width=jnp.where(every, width, jnp.inf),
+            next_width=width,
+            num_steps=none,
+            done=no,
+            rows=no_rows(self.most, T.dtype),
+        )
+
+    def terminate(self, state: _State) -> Bool[Array, ""]:
+        return state.done
+
+    def fail(self, state: _State) -> Bool[Array, ""]:
+        return jnp.isnan(state.next_width)
+
+    def step(self, state: _State) -> _State:
+        """The minimum under the next width; the last is one that need not halve."""
+        s, graph, width = state, self.graph, state.next_width
+        last = (width > s.width / 2) | (s.num_steps == self.most - 1)
+        now = _problem(graph, s.parts, width, jnp.where(last, 1, self.doubt))
+        least = jnp.where(last, _LEFT, _LEFT**0.5)
+        new = minimise(now, s.found.T, self.max_steps, least, s.found.cycle)
         squares = now.squares(new.T)
         trust = now.trust(squares)
-        deviation = _inside_deviation(graph, squares, trust, s.next_width)
-        width = jnp.clip(_DEVIATIONS * deviation, 0.5 * s.next_width, s.next_width)
-        width = jnp.maximum(width, 64 * jnp.finfo(width.dtype).eps)
-        new = new._replace(step=s.found.step + new.step, trace=None)
-        row = (
-            pose_change(s.found.T, new.T, scale),
-            s.next_width * s.parts,
-            weighted_mean(trust, graph.weight),
+        change = pose_change(s.found.T, new.T, length_scale(graph))
+        trusted = weighted_mean(trust, graph.weight)
+        wanted = _DEVIATIONS * self._deviation(squares, trust, width)
+        next_width = jnp.clip(wanted, width / 2, width)
+        return _State(
+            found=new._replace(step=s.found.step + new.step, trace=None),
+            parts=jnp.where(last, s.parts, self._parts(new.T, trust)),
+            width=width,
+            next_width=jnp.maximum(next_width, 64 * jnp.finfo(width.dtype).eps),
+            num_steps=s.num_steps + 1,
+            done=last,
+            rows=with_row(s.rows, s.num_steps, change, width * s.parts, trusted),
         )
-        rows = with_row(s.rows, s.round, *row)
-        parts = jnp.where(last, s.parts, _parts(graph, new.T, trust))
-        return _State(new, parts, s.next_width, width, s.round + 1, last, rows)
 
-    scale = length_scale(graph)
-    start = _before(graph, doubt, T_start, every)
-    return jax.lax.while_loop(lambda s: ~s.done, turn, start)
+    def _first_width(self, T: Array, squares: Array) -> Float[Array, ""]:
+        """A width that sees the right edges from the start.
 
+        Starts that have spread their drift show the deviation by their middle edge. One
+        chained along a tree leaves nothing at the edges of its tree and drift at the
+        right ones of the others, at least a quarter. Where lone closures are doubted,
+        nearly all others are right, and most of the drift may be at a few of them.
+        """
+        graph, present = self.graph, self.believed
+        open_edges = self._open(T) & present
+        chained = jnp.sum(present & ~open_edges) > 0.5 * (num_held(graph) - 1)
+        middle = nearest_rank(squares, present, 0.5) * self._spare_factor
+        middle = middle / chi2_median(lie.tangent_dim(graph.dim))
+        doubted = jnp.any((graph.weight > 0) & ~present)
+        drift = nearest_rank(squares, open_edges, jnp.where(doubted, SETTLED, 0.25))
+        usual = jnp.where(chained, drift, _DEVIATIONS**2 * middle)
+        floor = 64 * jnp.finfo(squares.dtype).eps
+        return jnp.maximum(_WIDER * jnp.sqrt(usual), floor)
 
-def _first_width(graph: PoseGraph, believed: Array, T: Array, squares: Array) -> Array:
-    """A width that sees the right edges from the start.
+    def _open(self, T: Array) -> Bool[Array, " e"]:
+        """Edges that do not hold exactly."""
+        sq = squared_errors(self.graph, T)
+        eps = 1e-4 if sq.dtype == jnp.float32 else 1e-8
+        return (self.graph.weight > 0) & (sq > eps**2)
 
-    Starts that have spread their drift show the deviation by their middle edge. One
-    chained along a tree leaves nothing at the edges of its tree and drift at the right
-    ones of the others: twice the lower quartile of those is wide enough. Where lone
-    closures are doubted, nearly all others are right, and most of the drift may be at
-    a few of them.
-    """
-    present = (graph.weight > 0) & believed
-    open_edges = _open_edges(graph, T) & believed
-    chained = jnp.sum(present & ~open_edges) > 0.5 * (num_held(graph) - 1)
-    middle = nearest_rank(squares, present, 0.5)
-    middle = middle / CHI2_MEDIAN[lie.tangent_dim(graph.dim)]
-    spread = _FIRST * jnp.sqrt(middle * _spare(graph))
-    doubted = jnp.any((graph.weight > 0) & ~believed)
-    sifted, unsifted = jnp.asarray([_SIFTED, _UNSIFTED], squares.dtype)
-    times, right = jnp.where(doubted, sifted, unsifted)
-    drift = times * jnp.sqrt(nearest_rank(squares, open_edges, right))
-    floor = 64 * jnp.finfo(squares.dtype).eps
-    return jnp.maximum(jnp.where(chained, drift, spread), floor)
+    def _deviation(self, squares: Array, trust: Array, width: Array) -> Array:
+        """Of one whitened component, by the mean of the edges inside a kernel."""
+        w = jnp.where(self.graph.weight > 0, trust, 0)
+        total = jnp.maximum(jnp.sum(w), jnp.finfo(w.dtype).tiny)
+        mean = jnp.sum(w * squares) / total / lie.tangent_dim(self.graph.dim)
+        return jnp.sqrt(variance_inside(mean, width) * self._spare_factor)
 
+    def _parts(self, T: Array, trust: Array) -> Float[Array, "2"]:
+        """Of one component of the translation and of the rotation, by the middle edges.
 
-def _open_edges(graph: PoseGraph, T: Array) -> Array:
-    """Edges that do not hold exactly."""
-    rotation, translation = graph.differences(T)
-    sq = rotation / 2 + translation / length_scale(graph) ** 2
-    eps = 1e-4 if sq.dtype == jnp.float32 else 1e-8
-    return (graph.weight > 0) & (sq > eps**2)
+        Among those inside the kernel that do not hold exactly.
+        """
+        middle = middle_variances(self.graph, T, self._open(T) & (trust > 0.5))
+        floor = 64 * jnp.finfo(middle.dtype).eps
+        floor = floor * jnp.stack([length_scale(self.graph), jnp.ones_like(middle[1])])
+        return jnp.maximum(jnp.sqrt(middle * self._spare_factor), floor)
 
-
-def _inside_deviation(
-    graph: PoseGraph, squares: Array, trust: Array, width: Array
-) -> Array:
-    """Of one whitened component, by the mean of the edges inside a kernel.
-
-    As in `annealed_width`: the kernel's own narrowing of the mean is undone.
-    """
-    w = jnp.where(graph.weight > 0, trust, 0)
-    total = jnp.maximum(jnp.sum(w), jnp.finfo(w.dtype).tiny)
-    mean = jnp.sum(w * squares) / total / lie.tangent_dim(graph.dim)
-    ratio = jnp.minimum(mean / width**2, 0.9)
-    return jnp.sqrt(ratio / (1 - ratio) * _spare(graph)) * width
+    @property
+    def _spare_factor(self) -> Float[Array, ""]:
+        count = jnp.sum(self.graph.weight > 0, dtype=self.doubt.dtype)
+        return spare_factor(self.graph, count)
 
 
-def _parts(graph: PoseGraph, T: Array, trust: Array) -> Float[Array, "2"]:
-    """Of one component of the translation and of the rotation, by the middle edges.
-
-    Among those inside the kernel that do not hold exactly.
-    """
-    rotation, translation = graph.differences(T)
-    d, present = graph.dim, _open_edges(graph, T) & (trust > _INSIDE)
-    dof = lie.tangent_dim(d) - d
-    middle = jnp.stack(
-        [
-            nearest_rank(translation, present, 0.5) / CHI2_MEDIAN[d],
-            nearest_rank(rotation, present, 0.5) / (2 * CHI2_MEDIAN[dof]),
-        ]
-    )
-    floor = 64 * jnp.finfo(middle.dtype).eps
-    floor = floor * jnp.stack([length_scale(graph), jnp.ones_like(middle[1])])
-    return jnp.maximum(jnp.sqrt(middle * _spare(graph)), floor)
+class _Best(NamedTuple):
+    end: _State
+    score: Array
+    num_steps: Int[Array, ""]  # starts that were tried
+    settled: Bool[Array, ""]
 
 
-def _spare(graph: PoseGraph) -> Array:
-    """Edges over those that the poses do not use up, at most 4."""
-    count = jnp.sum(graph.weight > 0).astype(graph.weight.dtype)
-    spare = jnp.maximum(count - (num_held(graph) - 1), 0.25 * count)
-    return count / jnp.maximum(spare, 1)
+class _Attempts(AbstractIteration[Array, _Best]):
+    """The likeliest end from the starts, and from it with every edge."""
+
+    narrowing: _Narrowing
+    starts: Float[Array, "s v D D"]
+
+    def init(self, start: Array) -> _Best:
+        no = jnp.asarray(False)
+        return _Best(
+            end=self.narrowing.init((start, no)),
+            score=-jnp.full((), jnp.inf, start.dtype),
+            num_steps=jnp.asarray(0, jnp.int32),
+            settled=no,
+        )
+
+    def terminate(self, state: _Best) -> Bool[Array, ""]:
+        return state.settled
+
+    def fail(self, state: _Best) -> Bool[Array, ""]:
+        return jnp.asarray(False)
+
+    def step(self, state: _Best) -> _Best:
+        b, narrowing = state, self.narrowing
+        graph = narrowing.graph
+        every = b.num_steps == len(self.starts)
+        T_start = jnp.where(every, b.end.found.T, self.starts[b.num_steps])
+        begin = narrowing.init((T_start, every))
+        end = iterate(narrowing, begin, max_steps=narrowing.most).state
+        score = explained(graph, end.found.T).log_ratio
+        steps = b.end.found.step + end.found.step
+        better = score > b.score
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, b.end)
+        certain = jnp.where(narrowing.believed, graph.weight, 0)
+        certain = eqx.tree_at(lambda g: g.weight, graph, certain)
+        return _Best(
+            end=best._replace(found=best.found._replace(step=steps)),
+            score=jnp.maximum(score, b.score),
+            num_steps=b.num_steps + 1,
+            settled=agreed_share(certain, end.found.T) > SETTLED,
+        )

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.averaging.measures import length_scale
+from jaxreg.averaging.start.cycles import NEUTRAL
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph, product
@@ -13,12 +14,8 @@ from jaxreg.graph.trees import along_frames
 
 
 # Ends of closures next to each other are less than so many frames apart; each closure
-# is compared with so many that follow it in their order; errors of agreement, radians
-# and length scales.
-_NEAR, _COMPARED, _AGREES = 8, 3, 0.3
-# What others count that hold a frame; the shares of confirmed closures, and of frames
-# measured from the one before, below which all count.
-_DOUBTED, _USUAL, _SEQUENCE = 1e-3, 0.25, 0.5
+# is compared with so many that follow it in their order.
+_NEAR, _COMPARED = 8, 3
 
 
 def without_lone_closures(graph: PoseGraph) -> PoseGraph:
@@ -26,18 +23,20 @@ def without_lone_closures(graph: PoseGraph) -> PoseGraph:
 
     A sequence passes a place again for some frames and closes several loops there,
     which agree with each other along the frames between their ends. False closures
-    stand alone as a rule. Where few closures are confirmed, as in graphs that are no
-    sequences, all keep their weight. For starts: any weight of false closures bends a
+    stand alone as a rule. Where less than half of the closures are confirmed, or of the
+    frames measured from the one before, as in graphs that are no sequences, all keep
+    their weight. For starts: any weight of false closures bends a
     long sequence, which hardly resists, so only those stay that join components.
     """
     successive = jnp.abs(graph.edges[:, 0] - graph.edges[:, 1]) == 1
     closure = (graph.weight > 0) & ~successive
     supported = confirmed(graph, closure)
-    usual = jnp.sum(supported) >= _USUAL * jnp.sum(closure)
+    usual = jnp.sum(supported) >= jnp.sum(closure) / 2
     steps = jnp.sum((graph.weight > 0) & successive)
-    usual = usual & (steps >= _SEQUENCE * (graph.num_poses - 1))
+    usual = usual & (steps >= (graph.num_poses - 1) / 2)
     doubted = closure & ~supported & usual
-    weight = jnp.where(doubted, _DOUBTED * graph.weight, graph.weight)
+    little = jnp.finfo(graph.weight.dtype).eps ** 0.5
+    weight = jnp.where(doubted, little * graph.weight, graph.weight)
     tree = trees.maximum_spanning_tree(
         graph.edges, graph.T_i_j, weight, graph.num_poses
     )
@@ -63,7 +62,7 @@ def confirmed(graph: PoseGraph, closure: Bool[Array, " e"]) -> Bool[Array, " e"]
         expected = product(lie.inverse(T_world_i)[k], product(gap, T_world_i[m]))
         error = product(lie.inverse(jnp.roll(T_low_high, -step, axis=0)), expected)
         near = (jnp.roll(cell, -step) == cell) & (jnp.abs(m - high) < _NEAR)
-        agree = near & closure[order] & (_size(error, scale) < _AGREES**2)
+        agree = near & closure[order] & (_size(error, scale) < NEUTRAL[0] ** 2)
         supported = supported | agree | jnp.roll(agree, step)
     return jnp.zeros((graph.num_edges,), bool).at[order].set(supported)
 

@@ -18,14 +18,9 @@ from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import DENSE_LIMIT
 
 
-# Log odds that agreement with the best poses so far adds: more than doubt, less than
-# what several closing cycles say.
-_TOWARD_BEST = 10.0
 # Perturbations of log odds, from a few in a hundred to all that cycles say. (On the
 # scenes to choose on a ladder finds more than any one heat of it.)
 _HEAT = (0.25, 2.0)
-# The search ends after so many rounds without a gain: half of the usual ones.
-_PATIENCE = 8
 
 
 class CycleConsensus(AbstractAverager):
@@ -45,7 +40,8 @@ class CycleConsensus(AbstractAverager):
 
     Attributes:
         hypotheses: drawn in each round, under one vmap (static).
-        rounds: the largest number of rounds (static).
+        rounds: the largest number of rounds; half as many without a gain end the search
+            (static).
 
     Gradients: none (the start is cut).
     """
@@ -76,9 +72,10 @@ class CycleConsensus(AbstractAverager):
         self, graph: PoseGraph, odds: Float[Array, "s e"], begun: "_Best"
     ) -> "_Best":
         graph = jax.lax.stop_gradient(graph)
+        patience = (self.rounds + 1) // 2
 
         def unfinished(b: _Best) -> Array:
-            return ~b.settled & (b.round < self.rounds) & (b.idle < _PATIENCE)
+            return ~b.settled & (b.round < self.rounds) & (b.idle < patience)
 
         return jax.lax.while_loop(
             unfinished, lambda b: self._round(graph, odds, b), begun
@@ -95,9 +92,10 @@ class CycleConsensus(AbstractAverager):
             now, (2, self.hypotheses, graph.num_edges), odds.dtype
         )
         each = odds[jnp.arange(self.hypotheses) % odds.shape[0]]
-        right = jax.nn.sigmoid(explained(graph, best.T).log_odds)
+        # Doubt of agreement with the best poses adds nothing: chains of them drift.
+        right = jax.nn.softplus(explained(graph, best.T).log_odds)
         each = jnp.exp(heat * noise[0]) * each + 2 * heat * noise[1]
-        each = each + _TOWARD_BEST * right
+        each = each + right
         T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(each)
         T = jnp.concatenate([best.T[None], T])
         if graph.num_poses <= DENSE_LIMIT:

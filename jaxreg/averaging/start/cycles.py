@@ -13,9 +13,10 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.likelihood import prior_odds
+from jaxreg.averaging.likelihood import DEVIATIONS, prior_odds
 from jaxreg.averaging.measures import length_scale
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
@@ -24,25 +25,23 @@ from jaxreg.linear.laplacian import DENSE_LIMIT
 
 #: Cycles are tried for at most this many edges times frames.
 CYCLE_LIMIT = 1_000_000
-# Chosen on synthetic graphs and, as `NEUTRAL`, on the scenes of `evidence.py`: share of
-# right edges, power of the density, least and largest ratio, and rounds.
-_PRIOR, _POWER, _LEAST, _CAP, _ROUNDS = 0.4, 4, 0.3, 1e4, 6
-#: Closing errors, in radians and length scales, that speak neither for nor against.
-NEUTRAL = (0.2, 0.1, 0.05, 0.025)
-# Edges over frames below which graphs of more than `DENSE_LIMIT` frames have too few
-# cycles of three to judge by.
-_LOOPS = 2
-# Ratios whose product neither overflows nor underflows in float32.
-_TOGETHER = 8
+# Chosen on synthetic graphs: power of the density, least and largest ratio, and rounds.
+_POWER, _LEAST, _CAP, _ROUNDS = 4, 0.3, 1e4, 6
+#: Closing errors, in radians and length scales, that speak neither for nor against:
+#: deviations of right edges, from the widest at which few wrong ones close.
+NEUTRAL = DEVIATIONS[1:5]
+# As many ratios as have a product in float32.
+_TOGETHER = int(math.log(np.finfo(np.float32).max, _CAP))
 
 
 def judged(graph: PoseGraph) -> bool:
     """Whether `edge_log_odds` looks at the cycles of a graph.
 
-    If it is small, or of moderate size and not nearly a tree.
+    If it is small, or of moderate size and has a cycle for each frame: sparser ones
+    have hardly any of three edges.
     """
-    sparse = graph.num_edges < _LOOPS * graph.num_poses
-    if sparse and graph.num_poses > DENSE_LIMIT:
+    cycles = graph.num_edges - graph.num_poses + 1
+    if cycles < graph.num_poses and graph.num_poses > DENSE_LIMIT:
         return False
     return graph.num_edges * graph.num_poses <= CYCLE_LIMIT
 
@@ -60,7 +59,7 @@ def edge_log_odds(graph: PoseGraph) -> Float[Array, "s e"]:
     """
     graph = jax.lax.stop_gradient(graph)
     present = graph.weight > 0
-    prior = prior_odds(graph) + math.log(_PRIOR / (1 - _PRIOR))
+    prior = prior_odds(graph)
     error, closed, via_i, via_j = _cycles(graph)
     pad = ((0, 0), (0, -graph.num_poses % _TOGETHER))
 

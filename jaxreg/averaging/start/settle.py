@@ -7,16 +7,15 @@ from jaxtyping import Array, Float
 from jaxreg.averaging.likelihood import explained
 from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.steps.iterate import nearby_rotation
-from jaxreg.averaging.steps.kernel_width import gaussian_trust
+from jaxreg.averaging.steps.kernel_width import KERNEL_DEVIATIONS, gaussian_trust
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 from jaxreg.linear.laplacian import laplacian
 from jaxreg.linear.operator import divergence
 
 
-# Kernel widths, in radians and length scales: from what holds on to a start to what
-# sees past the noise of real scans; but never less than twice the likeliest deviation.
-_WIDTHS = (0.25, 0.2, 0.15, 0.12, 0.1)
+# Steps: each follows the likeliest deviation, which falls as the chains settle.
+_STEPS = 5
 
 
 def settled(
@@ -28,8 +27,8 @@ def settled(
     """
     num, scale = graph.num_poses, length_scale(graph)
 
-    def step(T: Array, w: Array) -> tuple[Array, None]:
-        w = jnp.maximum(w, 2 * explained(graph, T).deviation)
+    def step(_: Array, T: Array) -> Array:
+        w = KERNEL_DEVIATIONS * explained(graph, T).deviation
         trust = graph.weight * gaussian_trust(graph, T, jnp.stack([w * scale, w]))
         top = jnp.max(trust)
         trust = trust / jnp.where(top > 0, top, 1)
@@ -40,7 +39,6 @@ def settled(
         ridge = 1e-5 * jnp.max(jnp.diagonal(L)) * jnp.eye(num, dtype=L.dtype)
         factor = jnp.linalg.cholesky(L + ridge)
         tangent = jax.scipy.linalg.cho_solve((factor, True), rhs)
-        return nearby_rotation(product(lie.exp(tangent), T)), None
+        return nearby_rotation(product(lie.exp(tangent), T))
 
-    widths = jnp.asarray(_WIDTHS, T_world_i.dtype)
-    return jax.lax.scan(step, T_world_i, widths)[0]
+    return jax.lax.fori_loop(0, _STEPS, step, T_world_i)

@@ -22,7 +22,9 @@ from jaxreg.linear.operator import divergence
 
 
 #: Relative tolerance of a step's system: each step takes up what the last one left.
-STEP_TOLERANCE = 1e-4
+STEP_TOLERANCE = 1e-2
+#: A width that changes by less than this share stands still.
+STILL = 1e-3
 #: Kernel widths `(2,)` (length, radians) at given poses, from the widths before.
 WidthOf = Callable[[PoseGraph, Array, Array], Array]
 #: Trust of each edge `(e,)` at given poses and widths.
@@ -200,7 +202,9 @@ class _Averaging(loop.AbstractIteration[tuple[Array, Array], _State]):
         moved = pose_change(state.T, T, self.scale)
         trusted = weighted_mean(trust, graph.weight)
         rows = with_row(state.rows, state.num_steps, moved, width, trusted)
-        shrinking = jnp.any(width < 0.999 * before) & jnp.all(jnp.isfinite(before))
+        shrinking = jnp.any(width < (1 - STILL) * before) & jnp.all(
+            jnp.isfinite(before)
+        )
         change = moved + jnp.where(shrinking, self.limit, 0)
         return _State(T, width, change, state.num_steps + 1, rows)
 

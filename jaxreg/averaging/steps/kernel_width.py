@@ -3,24 +3,19 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import scipy.special
+from jaxtyping import Array, Bool, Float
 
 from jaxreg.averaging.likelihood import explained
 from jaxreg.averaging.measures import length_scale, nearest_rank, num_held
+from jaxreg.averaging.steps.iterate import STILL
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.small import inverse
 
 
-# The kernel is three standard deviations of the noise wide: right edges lose little
-# (the mean is 2 % worse than with the inliers known), wrong ones most.
-_DEVIATIONS = 3.0
-# Edges with more trust than this are inside.
-_INSIDE = 0.05
-#: Medians of chi-squared laws by their degrees of freedom.
-CHI2_MEDIAN = {1: 0.4549, 2: 1.3863, 3: 2.3660, 6: 5.3481}
-_NARROWEST_STEP = 0.25
-# A width that changes by less than this share has settled.
-_SETTLED = 1e-3
+#: A kernel is three standard deviations of the noise wide: right edges lose little (the
+#: mean is 2 % worse than with the inliers known), wrong ones most.
+KERNEL_DEVIATIONS = 3.0
 
 
 def gaussian_trust(
@@ -39,7 +34,9 @@ def first_width(
 
     Three of the likeliest deviations, and half of the octave between those compared.
     """
-    width = _DEVIATIONS * 2**0.5 * explained(graph, T_world_i, alone=True).deviation
+    width = (
+        KERNEL_DEVIATIONS * 2**0.5 * explained(graph, T_world_i, alone=True).deviation
+    )
     return jnp.stack([width * length_scale(graph), width])
 
 
@@ -51,14 +48,11 @@ def annealed_width(
 ) -> Float[Array, "2"]:
     """The next width: three deviations of the edges inside the present one.
 
-    Never wider than before, nor narrower than a quarter of it. The weighted mean square
-    v of Gaussian noise of variance s^2 under a Gaussian kernel of width w is
-    1 / (1/s^2 + 1/w^2), which is solved for s^2; s^2 is enlarged for the unknowns that
-    the poses take up.
-    `scale` is the `length_scale` of the graph.
+    Never wider than before, nor narrower than half of it. `scale` is the `length_scale`
+    of the graph.
     """
     target = _three_deviations(graph, T_world_i, width, scale)
-    return jnp.clip(target, _NARROWEST_STEP * width, width)
+    return jnp.clip(target, width / 2, width)
 
 
 @eqx.filter_custom_jvp
@@ -83,7 +77,7 @@ def _followed_width_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         lambda g, T: _three_deviations(g, T, width, scale), primals[1:3], tangents[1:3]
     )
     by_width = jax.jacfwd(lambda w: _three_deviations(graph, T_world_i, w, scale))
-    settled = jnp.abs(target - width) < _SETTLED * width
+    settled = jnp.abs(target - width) < STILL * width
     slope = jnp.where(settled[:, None], by_width(width), 0)
     change = jnp.where(settled, change, 0)
     return width, inverse(jnp.eye(2, dtype=slope.dtype) - slope) @ change
@@ -100,19 +94,48 @@ def _three_deviations(
     dof = d * (d - 1) // 2
     v = jnp.stack([jnp.sum(w * translation) / d, jnp.sum(w * rotation) / (2 * dof)])
     v = v / total
-    ratio = jnp.minimum(v / width**2, 0.9)
-    count = jnp.sum(jnp.where(graph.weight > 0, trust, 0))
-    spare = jnp.maximum(count - (num_held(graph) - 1), 0.25 * count)
-    variance = ratio / (1 - ratio) * width**2
     # Noise of many scales would draw the mean to the finest; the median stands.
-    inside = (graph.weight > 0) & (trust > _INSIDE)
-    middle = jnp.stack(
-        [
-            nearest_rank(translation, inside, 0.5) / CHI2_MEDIAN[d],
-            nearest_rank(rotation, inside, 0.5) / (2 * CHI2_MEDIAN[dof]),
-        ]
+    inside = (graph.weight > 0) & (trust > 0.5)
+    middle = middle_variances(graph, T_world_i, inside)
+    count = jnp.sum(jnp.where(graph.weight > 0, trust, 0))
+    variance = jnp.maximum(variance_inside(v, width), middle) * spare_factor(
+        graph, count
     )
-    variance = jnp.maximum(variance, middle) * count / jnp.maximum(spare, 1e-3)
     floor = 64 * jnp.finfo(w.dtype).eps * jnp.stack([scale, jnp.ones_like(total)])
     # In this order: the root has no derivative where the edges agree exactly.
-    return _DEVIATIONS * jnp.sqrt(jnp.maximum(variance, (floor / _DEVIATIONS) ** 2))
+    least = (floor / KERNEL_DEVIATIONS) ** 2
+    return KERNEL_DEVIATIONS * jnp.sqrt(jnp.maximum(variance, least))
+
+
+def variance_inside(mean: Array, width: Array) -> Array:
+    """Of normal noise whose mean square is `mean` under a kernel of that width.
+
+    Noise of variance s^2 has the mean 1 / (1/s^2 + 1/width^2), which is solved for s^2.
+    """
+    ratio = jnp.minimum(mean / width**2, 0.9)
+    return ratio / (1 - ratio) * width**2
+
+
+def middle_variances(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"], of: Bool[Array, " e"]
+) -> Float[Array, "2"]:
+    """Of one component of the translation and of the rotation, by the middle edges."""
+    rotation, translation = graph.differences(T_world_i)
+    d = graph.dim
+    return jnp.stack(
+        [
+            nearest_rank(translation, of, 0.5) / chi2_median(d),
+            nearest_rank(rotation, of, 0.5) / (2 * chi2_median(d * (d - 1) // 2)),
+        ]
+    )
+
+
+def chi2_median(dof: int) -> float:
+    """Of the chi-squared law: the middle square of noise of variance one."""
+    return float(scipy.special.chdtri(dof, 0.5))
+
+
+def spare_factor(graph: PoseGraph, count: Float[Array, ""]) -> Float[Array, ""]:
+    """Edges over those that the poses do not use up, at most 4: poses take up noise."""
+    spare = jnp.maximum(count - (num_held(graph) - 1), count / 4)
+    return jnp.where(count > 0, count / jnp.where(spare > 0, spare, 1), 1)

@@ -21,7 +21,7 @@ from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.measures import length_scale, weighted_mean
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError
-from jaxreg.averaging.steps.iterate import nearby_rotation, pose_change
+from jaxreg.averaging.steps.iterate import STEP_TOLERANCE, nearby_rotation, pose_change
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
@@ -35,13 +35,9 @@ from jaxreg.robust import AbstractKernel
 # a pose has moved by this share of the length of an edge: how turns of one end shift
 # the other depends on where they are, and on it how stiff bends of long chains are.
 _STALE, _MOVED = 2, 0.3
-# Of the system of a step: the next step takes up what is left.
-_SYSTEM_TOLERANCE = 1e-2
-# Share of a step's gain that conjugate gradients may leave to the next.
-_UNDONE = 0.1
 # Damping after the first refused step, and the least. There is none before: even 1e-9
 # of the diagonal holds back the bending of a long chain, so that steps converge slowly.
-_DAMPED, _LEAST = 1e-6, 1e-9
+_DAMPED = 1e-6
 
 
 class Problem(NamedTuple):
@@ -209,11 +205,12 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         )
         # A refused step calls for more damping, unless damping can help no more.
         refused = jnp.where(s.damping < 1e3, jnp.inf, 0)
-        eased = jnp.where(s.damping > _LEAST, s.damping / 10, 0)
+        eased = jnp.where(s.damping > _DAMPED, s.damping / 10, 0)
         gain = jnp.where(better, gain, refused).astype(cost.dtype)
         # Steps converge at least linearly: each gains less than the one before. And
         # hardly faster, as conjugate gradients leave some of each step undone.
-        ratio = jnp.where(jnp.isfinite(s.gain), jnp.clip(gain / s.gain, _UNDONE, 1), 1)
+        left = STEP_TOLERANCE**0.5
+        ratio = jnp.where(jnp.isfinite(s.gain), jnp.clip(gain / s.gain, left, 1), 1)
         damping = jnp.where(better, eased, jnp.maximum(s.damping * 30, _DAMPED))
         usual = jnp.where(kept, s.cycle.usual, jnp.maximum(rounds, 1))
         shift = jnp.max(jnp.abs(lie.translation(T) - lie.translation(s.T)))
@@ -247,7 +244,7 @@ def _tangents(
     Pose 0 and poses that no weight holds stay.
     """
     rhs = -divergence(matrix.edges, force, len(matrix.own))[..., None]
-    solver = MultigridCG(_SYSTEM_TOLERANCE, max_steps=300)
+    solver = MultigridCG(STEP_TOLERANCE, max_steps=300)
     state = solver.init(matrix, {"preconditioner": inverse})
     x, _, stats = solver.compute(state, rhs, {})
     # Damping leaves pose 0 some of the motion that all share.
