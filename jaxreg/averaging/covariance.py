@@ -5,19 +5,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg._core.checks import shown
+from jaxreg._core.checks import check_count, shown
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
 
 
-#: Largest number of unknowns, k per frame, for which covariances are computed.
-COVARIANCE_LIMIT = 6000
-
-
 def pose_covariances(
-    graph: PoseGraph, solution: AveragingSolution
+    graph: PoseGraph, solution: AveragingSolution, *, max_unknowns: int = 6000
 ) -> Float[Array, "v k k"]:
     """The marginal covariance of each pose, with frame 0 known exactly.
 
@@ -30,13 +26,15 @@ def pose_covariances(
     Args:
         graph: the graph that was averaged.
         solution: its solution, from any method.
+        max_unknowns: k per frame, at most; the matrix is dense, 144 MB of float32 for
+            the default (static).
 
     Returns:
         `(v, k, k)`; 0 for frame 0, NaN for frames that no trusted edge holds.
 
     Raises:
-        ValueError: for more than `COVARIANCE_LIMIT` unknowns, as the matrix is dense;
-            and for a solution of another graph.
+        ValueError: for more unknowns than `max_unknowns`, and for a solution of another
+            graph.
         TypeError: for anything but a graph and a solution.
 
     Gradients: none (cut).
@@ -52,6 +50,13 @@ def pose_covariances(
             f"solution: wanted one of {graph.num_edges} edges, found "
             f"{solution.edge_weight.shape}."
         )
+    check_count(max_unknowns, "max_unknowns")
+    k = lie.tangent_dim(graph.dim)
+    if graph.num_poses * k > max_unknowns:
+        raise ValueError(
+            f"graph: wanted at most {max_unknowns // k} poses for covariances, "
+            f"found {graph.num_poses}."
+        )
     return _covariances(graph, solution)
 
 
@@ -61,11 +66,6 @@ def _covariances(
 ) -> Float[Array, "v k k"]:
     graph, solution = jax.lax.stop_gradient((graph, solution))
     num, k = graph.num_poses, lie.tangent_dim(graph.dim)
-    if num * k > COVARIANCE_LIMIT:
-        raise ValueError(
-            f"graph: wanted at most {COVARIANCE_LIMIT // k} poses for covariances, "
-            f"found {num}."
-        )
     usable = jnp.all(jnp.isfinite(graph.T_i_j), axis=(1, 2)) & graph.mask
     trust = jnp.where(usable, solution.edge_weight, 0)
     T = solution.T_world_i

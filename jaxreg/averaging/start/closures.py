@@ -13,9 +13,9 @@ from jaxreg.graph.pose_graph import PoseGraph, product
 from jaxreg.graph.trees import along_frames
 
 
-# Ends of closures next to each other are less than so many frames apart; each closure
-# is compared with so many that follow it in their order.
-_NEAR, _COMPARED = 8, 3
+# Closures next to each other have ends less than so many frames apart, and are less
+# than so many apart in their order: a place passed again is seen for some frames.
+_NEAR = 8
 
 
 def without_lone_closures(graph: PoseGraph) -> PoseGraph:
@@ -56,15 +56,18 @@ def confirmed(graph: PoseGraph, closure: Bool[Array, " e"]) -> Bool[Array, " e"]
     cell, low, high, T_low_high = (x[order] for x in (cell, low, high, T_low_high))
     # The motion between the chained places of the ends that the closure asks for.
     gap = product(T_world_i[low], product(T_low_high, lie.inverse(T_world_i)[high]))
-    supported = jnp.zeros((graph.num_edges,), bool)
-    for step in range(1, _COMPARED + 1):
+
+    def compared(step: Array, supported: Array) -> Array:
         k, m = jnp.roll(low, -step), jnp.roll(high, -step)
         expected = product(lie.inverse(T_world_i)[k], product(gap, T_world_i[m]))
         error = product(lie.inverse(jnp.roll(T_low_high, -step, axis=0)), expected)
         near = (jnp.roll(cell, -step) == cell) & (jnp.abs(m - high) < _NEAR)
         agree = near & closure[order] & (_size(error, scale) < NEUTRAL[0] ** 2)
-        supported = supported | agree | jnp.roll(agree, step)
-    return jnp.zeros((graph.num_edges,), bool).at[order].set(supported)
+        return supported | agree | jnp.roll(agree, step)
+
+    none = jnp.zeros((graph.num_edges,), bool)
+    supported = jax.lax.fori_loop(1, _NEAR, compared, none)
+    return none.at[order].set(supported)
 
 
 def _size(T: Float[Array, "e D D"], scale: Float[Array, ""]) -> Float[Array, " e"]:

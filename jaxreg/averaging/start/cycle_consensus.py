@@ -42,15 +42,17 @@ class CycleConsensus(AbstractAverager):
         hypotheses: drawn in each round, under one vmap (static).
         rounds: the largest number of rounds; half as many without a gain end the search
             (static).
+        max_cycles: graphs of more edges times frames are too large for cycles (static).
 
     Gradients: none (the start is cut).
     """
 
     hypotheses: int = eqx.field(static=True, default=32)
     rounds: int = eqx.field(static=True, default=16)
+    max_cycles: int = eqx.field(static=True, default=1_000_000)
 
     def __check_init__(self) -> None:
-        check_counts(self, hypotheses=1, rounds=1)
+        check_counts(self, hypotheses=1, rounds=1, max_cycles=0)
 
     def solve(
         self,
@@ -59,7 +61,7 @@ class CycleConsensus(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Finds a start for a prepared graph; `edge_weight` is the belief in edges."""
-        if not judged(graph):
+        if not judged(graph, self.max_cycles):
             return _by_trees(graph)
         odds, best = _begun(graph, key)
         # Most graphs are done: the search is compiled for one that is not.

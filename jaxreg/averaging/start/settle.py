@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.likelihood import explained
+from jaxreg.averaging.likelihood import DEVIATIONS, explained
 from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.steps.iterate import nearby_rotation
 from jaxreg.averaging.steps.kernel_width import KERNEL_DEVIATIONS, gaussian_trust
@@ -14,16 +14,14 @@ from jaxreg.linear.laplacian import laplacian
 from jaxreg.linear.operator import divergence
 
 
-# Steps: each follows the likeliest deviation, which falls as the chains settle.
-_STEPS = 5
-
-
 def settled(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"]
 ) -> Float[Array, "v D D"]:
     """The poses after a few steps of averaging the motions that agree with them.
 
-    A chain of motions drifts; what agrees with it shows only then. Dense over frames.
+    A chain of motions drifts; what agrees with it shows only then. The kernel is that
+    of the likeliest deviation: as many steps as it has octaves to fall. Dense over
+    frames.
     """
     num, scale = graph.num_poses, length_scale(graph)
 
@@ -41,4 +39,4 @@ def settled(
         tangent = jax.scipy.linalg.cho_solve((factor, True), rhs)
         return nearby_rotation(product(lie.exp(tangent), T))
 
-    return jax.lax.fori_loop(0, _STEPS, step, T_world_i)
+    return jax.lax.fori_loop(0, len(DEVIATIONS), step, T_world_i)
