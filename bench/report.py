@@ -1,5 +1,8 @@
 """Writes REPORT.md and its plots from records.
 
+By hand, without pandas: cells are numbers of three digits, spreads, ratios and reasons,
+which its `to_markdown` (with tabulate) would be handed as text all the same.
+
 Run: python -m bench.report FILE --out DIR
 """
 

@@ -54,7 +54,7 @@ DEVIATIONS = tuple(0.5 / 2**k for k in range(8))
 _DIMENSION = 0.8
 # Log odds that p may have: from 1 to 99 %, of near views one half at least.
 _LOG_ODDS = (-4.5, -3.0, -1.5, 0.0, 1.5, 3.0, 4.5)
-#: Poses that agree with more than this share of believed edges need no search: noise
+#: Poses that agree with more than this share of trusted edges need no search: noise
 #: leaves out about one of a hundred right ones.
 SETTLED = 0.98
 # Neighbours t that may be near. With 2 as well, sparse graphs agree by chance.
@@ -123,40 +123,9 @@ def explained(
 
     Gradients: none (cut).
     """
+    dimension, deviations = _DIMENSION, DEVIATIONS
     if alone:
-        dimension = float(lie.tangent_dim(graph.dim))
-        return _explained(graph, T_world_i, dimension, DEVIATIONS[1:])
-    return _explained(graph, T_world_i, _DIMENSION, DEVIATIONS)
-
-
-def least_after_fitting(found: Explained) -> Float[Array, ""]:
-    """What other poses of the same right edges reach, but for a standard deviation.
-
-    The terms r^2 / (2 s^2) of right edges have variance D / 2 each.
-    """
-    right = jnp.sum(jax.nn.sigmoid(found.log_odds))
-    return found.log_ratio - jnp.sqrt(_DIMENSION / 2 * right)
-
-
-def agreed_share(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
-) -> Float[Array, ""]:
-    """The share of the edges to spare that are likelier right than wrong.
-
-    A tree agrees with its own edges, wherever it leads: only those beyond count, but
-    where there are none. 0 without edges.
-    """
-    present = jnp.sum(graph.weight > 0)
-    right = jnp.sum(explained(graph, T_world_i).log_odds > 0)
-    tree = num_held(graph).astype(right.dtype) - 1
-    tree = jnp.where(present > tree, tree, 0)
-    count = jnp.maximum(present - tree, 1).astype(graph.weight.dtype)
-    return (right - tree) / count
-
-
-def _explained(
-    graph: PoseGraph, T_world_i: Array, dimension: float, deviations: tuple[float, ...]
-) -> Explained:
+        dimension, deviations = float(lie.tangent_dim(graph.dim)), DEVIATIONS[1:]
     graph, T_world_i = jax.lax.stop_gradient((graph, T_world_i))
     sq, weigh = squared_errors(graph, T_world_i), prior_odds(graph)
     log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
@@ -195,6 +164,31 @@ def _explained(
         ladder[s],
         jnp.where(graph.weight > 0, right, -jnp.inf),
     )
+
+
+def least_after_fitting(found: Explained) -> Float[Array, ""]:
+    """What other poses of the same right edges reach, but for a standard deviation.
+
+    The terms r^2 / (2 s^2) of right edges have variance D / 2 each.
+    """
+    right = jnp.sum(jax.nn.sigmoid(found.log_odds))
+    return found.log_ratio - jnp.sqrt(_DIMENSION / 2 * right)
+
+
+def agreed_share(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+) -> Float[Array, ""]:
+    """The share of the edges to spare that are likelier right than wrong.
+
+    A tree agrees with its own edges, wherever it leads: only those beyond count, but
+    where there are none. 0 without edges.
+    """
+    present = jnp.sum(graph.weight > 0)
+    right = jnp.sum(explained(graph, T_world_i).log_odds > 0)
+    tree = num_held(graph).astype(right.dtype) - 1
+    tree = jnp.where(present > tree, tree, 0)
+    count = jnp.maximum(present - tree, 1).astype(graph.weight.dtype)
+    return (right - tree) / count
 
 
 def squared_errors(

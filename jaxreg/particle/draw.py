@@ -10,11 +10,14 @@ two poses, and a wrong pose is rarely found twice, so both go on to the filter.
 The constants were chosen on pairs of real scans, horses, boxes and cylinders.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
 from jaxreg.local import LocalOptimiser
@@ -115,22 +118,14 @@ def draw_until_sure(
         batch_size: particles in one vectorised block, at most.
     """
     group, groups = _groups(num, batch_size)
-    drawing = _Drawing(problem, optimiser, energy, widths, num, num_steps, group)
-    points = jnp.maximum(jnp.sum(problem.source_mask), 1).astype(T.dtype)
-    drawn = groups * group
-
-    def body(state: tuple[Array, Particles, Array]) -> tuple[Array, Particles, Array]:
-        number, particles, _ = state
-        particles = drawing.next_group(number, particles)
-        settled = particles.rows(slice(drawn, None))
-        return number + 1, particles, _agree(settled, num_agreeing, points)
-
-    rows = jnp.arange(drawn + drawn // _BLOCKS) % len(T)
-    _, particles, sure = lax.while_loop(
-        lambda state: (state[0] < groups) & ~state[2],
-        body,
-        (jnp.zeros((), jnp.int32), Particles.at(T[rows], num), jnp.asarray(False)),
+    drawing = _Drawing(
+        problem, optimiser, energy, widths, num, num_steps, num_agreeing, group
     )
+    drawn = groups * group
+    rows = jnp.arange(drawn + drawn // _BLOCKS) % len(T)
+    begin = drawing.init(Particles.at(T[rows], num))
+    ended = iterate(drawing, begin, max_steps=groups)
+    particles, sure = ended.state.particles, ended.converged
     # As many rows as there were poses, also where that is more than were to be drawn.
     row = jnp.arange(len(T))
     first = particles.rows(jnp.minimum(row, drawn - 1))
@@ -141,8 +136,14 @@ def draw_until_sure(
     return Drawn(first, settled, sure)
 
 
-class _Drawing(eqx.Module):
-    """What is done with each group.
+class _Draws(NamedTuple):
+    particles: Particles
+    sure: Bool[Array, ""]
+    num_steps: Int[Array, ""]  # groups
+
+
+class _Drawing(AbstractIteration[Particles, _Draws]):
+    """Groups in turn: measured, and the best of each settled, until they agree.
 
     The particles are those to draw, in groups, and behind them a block for the settled
     of each group. `num` of those to draw count; the others fill the last group.
@@ -154,22 +155,41 @@ class _Drawing(eqx.Module):
     widths: tuple[Scalar, Scalar]
     num: int = eqx.field(static=True)
     num_steps: int = eqx.field(static=True)
+    num_agreeing: int = eqx.field(static=True)
     group: int = eqx.field(static=True)
 
-    def next_group(self, number: Int[Array, ""], particles: Particles) -> Particles:
-        """With that group measured, and the best of it settled."""
+    def init(self, start: Particles) -> _Draws:
+        return _Draws(start, jnp.asarray(False), jnp.asarray(0, jnp.int32))
+
+    def terminate(self, state: _Draws) -> Bool[Array, ""]:
+        return state.sure
+
+    def fail(self, state: _Draws) -> Bool[Array, ""]:
+        return jnp.asarray(False)
+
+    def step(self, state: _Draws) -> _Draws:
+        """With the next group measured, and the best of it settled."""
+        number = state.num_steps
 
         def phase(which: Array, particles: Particles) -> Particles:
             return self._phase(which == 1, number, particles)
 
         # One loop compiles the measurement once.
-        return lax.fori_loop(0, 2, phase, particles)
+        particles = lax.fori_loop(0, 2, phase, state.particles)
+        settled = particles.rows(slice(self._drawn(particles), None))
+        points = jnp.maximum(jnp.sum(self.problem.source_mask), 1)
+        points = points.astype(particles.energy.dtype)
+        sure = _agree(settled, self.num_agreeing, points)
+        return _Draws(particles, sure, number + 1)
+
+    def _drawn(self, particles: Particles) -> int:
+        return particles.energy.size * _BLOCKS // (_BLOCKS + 1)
 
     def _phase(
         self, settling: Bool[Array, ""], number: Int[Array, ""], particles: Particles
     ) -> Particles:
         block = self.group // _BLOCKS
-        drawn = particles.energy.size * _BLOCKS // (_BLOCKS + 1)
+        drawn = self._drawn(particles)
         group, home = number * self.group, drawn + number * block
         measured = lax.dynamic_slice_in_dim(particles.energy, group, self.group)
         best = lax.top_k(-measured, block)[1]

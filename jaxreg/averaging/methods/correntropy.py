@@ -55,7 +55,9 @@ class Correntropy(AbstractAverager):
 
     Attributes:
         max_steps: largest number of steps (static).
-        tolerance: stop below this change, radians and share of the size of the scene.
+        tolerance: stop when a step turns by at most so many radians and shifts by at
+            most so many scene sizes; graphs of more than `DENSE_LIMIT` frames stop by
+            their objective.
         initialiser: finds the start when `init` is None.
 
     Lengths are measured in the graph's own length scale, so another unit does not
@@ -90,19 +92,9 @@ class Correntropy(AbstractAverager):
         return self._small(graph, T_start)
 
     @eqx.filter_jit
-    def _large(
-        self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
-    ) -> AveragingSolution:
-        return solution_of(graph, self._graduated(graph, init, key))
-
-    @eqx.filter_jit
     def _small(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"]
     ) -> AveragingSolution:
-        end = self._annealed(graph, T_start)
-        return solution_of(graph, _or_start(graph, end, T_start))
-
-    def _annealed(self, graph: PoseGraph, T_start: Float[Array, "v D D"]) -> Iterated:
         """From the likeliest width; from half of it where that loses likelihood.
 
         A kernel that is too wide draws poses to a larger group of edges that agree
@@ -110,41 +102,44 @@ class Correntropy(AbstractAverager):
         chance would.
         """
         fixed, T_start = jax.lax.stop_gradient((graph, T_start))
-        followed = eqx.Partial(followed_width, length_scale(fixed))
+        scale = length_scale(fixed)
         T = _better_start(fixed, T_start, fixed)
         least = least_after_fitting(explained(fixed, T))
         width = first_width(fixed, T)
 
+        def from_width(width: Array) -> Iterated:
+            return iterate(
+                fixed,
+                T,
+                width,
+                lambda g, T, w: annealed_width(g, T, w, scale),
+                gaussian_trust,
+                gauss_newton_step,
+                max_steps=self.max_steps,
+                tolerance=self.tolerance,
+            )
+
         def narrower(tried: tuple[Array, Array, Iterated]) -> tuple:
             number = tried[0]
-            end = self._from_width(fixed, T, width / 2**number)
+            end = from_width(width / 2**number)
             return number + 1, explained(fixed, end.T_world_i).log_ratio, end
 
-        blank = jax.eval_shape(lambda: self._from_width(fixed, T, width))
+        blank = jax.eval_shape(lambda: from_width(width))
         blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
+        # Not on the driver: what it would carry is a number and whole ends of it.
         _, _, end = jax.lax.while_loop(
             lambda tried: (tried[1] < least) & (tried[0] < len(DEVIATIONS)),
             narrower,
             (jnp.asarray(0, jnp.int32), jnp.full_like(least, -jnp.inf), blank),
         )
-        return gauss_newton_gradients(graph, end, gaussian_trust, followed)
+        followed = eqx.Partial(followed_width, scale)
+        end = gauss_newton_gradients(graph, end, gaussian_trust, followed)
+        return solution_of(graph, _or_start(graph, end, T_start))
 
-    def _from_width(self, graph: PoseGraph, T_start: Array, width: Array) -> Iterated:
-        scale = length_scale(graph)
-        return iterate(
-            graph,
-            T_start,
-            width,
-            lambda g, T, w: annealed_width(g, T, w, scale),
-            gaussian_trust,
-            gauss_newton_step,
-            max_steps=self.max_steps,
-            tolerance=self.tolerance,
-        )
-
-    def _graduated(
+    @eqx.filter_jit
+    def _large(
         self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
-    ) -> Iterated:
+    ) -> AveragingSolution:
         near = without_lone_closures(jax.lax.stop_gradient(graph))
         if init is None:
             T_start = starting_poses(self.initialiser, near, None, key)
@@ -153,7 +148,8 @@ class Correntropy(AbstractAverager):
             # A start of the caller's may be far off: plain steps that leave out what
             # pulls against them would bend it for good.
             starts = [_better_start(graph, init, graph)]
-        return graduated(graph, near, jnp.stack(starts), self.max_steps)
+        end = graduated(graph, near, jnp.stack(starts), self.max_steps)
+        return solution_of(graph, end)
 
 
 def _or_start(graph: PoseGraph, end: Iterated, T_start: Array) -> Iterated:

@@ -74,8 +74,8 @@ def graduated(
     Gradients: implicit at the fixed point, widths are cut.
     """
     fixed, near, starts = jax.lax.stop_gradient((graph, near, starts))
-    doubt = near.weight / jnp.where(fixed.weight > 0, fixed.weight, 1)
-    attempts = _Attempts(_Narrowing(fixed, doubt, max_steps), starts)
+    counted = near.weight / jnp.where(fixed.weight > 0, fixed.weight, 1)
+    attempts = _Attempts(_Narrowing(fixed, counted, max_steps), starts)
     begin = attempts.init(starts[0])
     end = iterate(attempts, begin, max_steps=len(starts) + 1).state.end
     trust_of = eqx.Partial(_trust, end.parts, end.width)
@@ -99,12 +99,13 @@ def _trust(
 
 
 def _problem(
-    graph: PoseGraph, parts: Array, width: Array, doubt: Array | float = 1.0
+    graph: PoseGraph, parts: Array, width: Array, counted: Array | float = 1.0
 ) -> Problem:
     W = precisions(graph, jnp.ones_like(graph.weight), parts)
     full = robust_problem(graph, LogError(), W, Welsch(), width)
     return full._replace(
-        loss=lambda s: doubt * full.loss(s), trust=lambda s: doubt * full.trust(s)
+        loss=lambda s: counted * full.loss(s),
+        trust=lambda s: counted * full.trust(s),
     )
 
 
@@ -122,27 +123,28 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
     """Minimises under narrower kernels until the edges inside fill the kernel.
 
     Then once more with all edges, to the end; at once and without a kernel if every
-    edge is to count. What edges count before the end is in `doubt`.
+    edge is to count. `counted` is the
+    share that edges have before the end.
     """
 
     graph: PoseGraph
-    doubt: Float[Array, " e"]
+    counted: Float[Array, " e"]
     max_steps: int  # of a minimisation
 
     @property
     def most(self) -> int:
         """Widths at most: as many as a float has halvings, and the last."""
-        return int(jnp.finfo(self.doubt.dtype).nmant) + 1
+        return int(jnp.finfo(self.counted.dtype).nmant) + 1
 
     @property
-    def believed(self) -> Bool[Array, " e"]:
+    def trusted(self) -> Bool[Array, " e"]:
         """Edges that count fully."""
-        return (self.graph.weight > 0) & (self.doubt == 1)
+        return (self.graph.weight > 0) & (self.counted == 1)
 
     def init(self, start: tuple[Array, Array]) -> _State:
         """Nothing minimised yet, from poses, and whether every edge is to count."""
         T, every = start
-        graph, one = self.graph, jnp.ones_like(self.doubt)
+        graph, one = self.graph, jnp.ones_like(self.counted)
         parts = self._parts(T, one)
         width = self._first_width(T, _problem(graph, parts, one[0]).squares(T))
         # Wide enough to be none, and its square is finite.
@@ -169,7 +171,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         """The minimum under the next width; the last is one that need not halve."""
         s, graph, width = state, self.graph, state.next_width
         last = (width > s.width / 2) | (s.num_steps == self.most - 1)
-        now = _problem(graph, s.parts, width, jnp.where(last, 1, self.doubt))
+        now = _problem(graph, s.parts, width, jnp.where(last, 1, self.counted))
         least = jnp.where(last, _LEFT, _LEFT**0.5)
         new = minimise(now, s.found.T, self.max_steps, least, s.found.cycle)
         squares = now.squares(new.T)
@@ -196,7 +198,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         right ones of the others, at least a quarter. Where lone closures are doubted,
         nearly all others are right, and most of the drift may be at a few of them.
         """
-        graph, present = self.graph, self.believed
+        graph, present = self.graph, self.trusted
         open_edges = self._open(T) & present
         chained = jnp.sum(present & ~open_edges) > 0.5 * (num_held(graph) - 1)
         middle = nearest_rank(squares, present, 0.5) * self._spare_factor
@@ -232,7 +234,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
 
     @property
     def _spare_factor(self) -> Float[Array, ""]:
-        count = jnp.sum(self.graph.weight > 0, dtype=self.doubt.dtype)
+        count = jnp.sum(self.graph.weight > 0, dtype=self.counted.dtype)
         return spare_factor(self.graph, count)
 
 
@@ -275,11 +277,11 @@ class _Attempts(AbstractIteration[Array, _Best]):
         steps = b.end.found.step + end.found.step
         better = score > b.score
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, b.end)
-        certain = jnp.where(narrowing.believed, graph.weight, 0)
-        certain = eqx.tree_at(lambda g: g.weight, graph, certain)
+        trusted = jnp.where(narrowing.trusted, graph.weight, 0)
+        trusted = eqx.tree_at(lambda g: g.weight, graph, trusted)
         return _Best(
             end=best._replace(found=best.found._replace(step=steps)),
             score=jnp.maximum(score, b.score),
             num_steps=b.num_steps + 1,
-            settled=agreed_share(certain, end.found.T) > SETTLED,
+            settled=agreed_share(trusted, end.found.T) > SETTLED,
         )

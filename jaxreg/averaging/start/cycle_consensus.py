@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import check_counts, is_concrete
+from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
 from jaxreg.averaging.likelihood import SETTLED, agreed_share, explained
@@ -28,7 +29,7 @@ class CycleConsensus(AbstractAverager):
 
     Each edge gets log odds from its 3-cycles at several scales (`edge_log_odds`), and
     each scale the tree of greatest odds. They are compared by the likelihood of all
-    motions (`explained`). Unless the best agrees with all edges that are believed at
+    motions (`explained`). Unless the best agrees with all edges that are trusted at
     some scale, further trees are drawn with randomly perturbed odds, round by round
     around the best so far; up to `DENSE_LIMIT` frames, their poses settle before they
     are compared.
@@ -60,44 +61,83 @@ class CycleConsensus(AbstractAverager):
         init: Float[Array, "v D D"] | None,
         key: Key | None,
     ) -> AveragingSolution:
-        """Finds a start for a prepared graph; `edge_weight` is the belief in edges."""
+        """Finds a start for a prepared graph; `edge_weight` is trust by cycles."""
         if not judged(graph, self.max_cycles):
             return _by_trees(graph)
-        odds, best = _begun(graph, key)
+        held = jax.lax.stop_gradient(graph)
+        search = _Search(held, self.hypotheses, self.rounds)
+        best = search.init(key)
         # Most graphs are done: the search is compiled for one that is not.
         if not is_concrete(best.settled) or not best.settled:
-            best = self._searched(graph, odds, best)
-        return _believed(graph, odds, best)
+            best = _searched(search, best)
+        return _with_trust(held, best)
+
+
+class _Best(NamedTuple):
+    """The likeliest poses so far."""
+
+    T: Float[Array, "v D D"]
+    log_ratio: Float[Array, ""]
+    odds: Float[Array, "s e"]
+    scale: Int[Array, ""]  # whose odds the first of them came from
+    settled: Bool[Array, ""]
+    idle: Int[Array, ""]  # rounds since the last gain
+    num_steps: Int[Array, ""]  # rounds
+    key: Key
+
+
+class _Search(AbstractIteration[Key | None, _Best]):
+    """Rounds of trees of perturbed odds around the best poses so far."""
+
+    graph: PoseGraph
+    hypotheses: int
+    rounds: int
 
     @eqx.filter_jit
-    def _searched(
-        self, graph: PoseGraph, odds: Float[Array, "s e"], begun: "_Best"
-    ) -> "_Best":
-        graph = jax.lax.stop_gradient(graph)
-        patience = (self.rounds + 1) // 2
+    def init(self, start: Key | None) -> _Best:
+        """The odds at each scale, and the best of their trees.
 
-        def unfinished(b: _Best) -> Array:
-            return ~b.settled & (b.round < self.rounds) & (b.idle < patience)
-
-        return jax.lax.while_loop(
-            unfinished, lambda b: self._round(graph, odds, b), begun
+        Prior weights and short chains are hypotheses of their own.
+        """
+        graph = self.graph
+        odds = edge_log_odds(graph)
+        weights = jnp.concatenate([odds, graph.weight[None]])
+        T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(weights)
+        T = jnp.concatenate([T, _shortest(graph, odds)[None]])
+        best, ratio = _likeliest(graph, T)
+        none = jnp.asarray(0, jnp.int32)
+        return _Best(
+            T=T[best],
+            log_ratio=ratio,
+            odds=odds,
+            scale=jnp.minimum(best, len(odds) - 1),
+            settled=_is_settled(graph, odds, T[best]),
+            idle=none,
+            num_steps=none,
+            key=jax.random.key(0) if start is None else start,
         )
 
-    def _round(self, graph: PoseGraph, odds: Array, best: "_Best") -> "_Best":
+    def terminate(self, state: _Best) -> Bool[Array, ""]:
+        return state.settled
+
+    def fail(self, state: _Best) -> Bool[Array, ""]:
+        return state.idle >= (self.rounds + 1) // 2
+
+    def step(self, state: _Best) -> _Best:
         """Trees of perturbed odds: factors exchange safe edges, terms doubtful ones.
 
         From cold ones, which stay near the best poses, to hot ones.
         """
+        graph, best, odds = self.graph, state, state.odds
         key, now = jax.random.split(best.key)
         heat = jnp.geomspace(*_HEAT, self.hypotheses, dtype=odds.dtype)[:, None]
         noise = jax.random.logistic(
             now, (2, self.hypotheses, graph.num_edges), odds.dtype
         )
         each = odds[jnp.arange(self.hypotheses) % odds.shape[0]]
-        # Doubt of agreement with the best poses adds nothing: chains of them drift.
-        right = jax.nn.softplus(explained(graph, best.T).log_odds)
         each = jnp.exp(heat * noise[0]) * each + 2 * heat * noise[1]
-        each = each + right
+        # What contradicts the best poses loses nothing: chains of them drift.
+        each = each + jax.nn.softplus(explained(graph, best.T).log_odds)
         T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(each)
         T = jnp.concatenate([best.T[None], T])
         if graph.num_poses <= DENSE_LIMIT:
@@ -108,45 +148,9 @@ class CycleConsensus(AbstractAverager):
             T=jnp.where(better, T[found], best.T),
             log_ratio=jnp.maximum(ratio, best.log_ratio),
             idle=jnp.where(better, 0, best.idle + 1),
-            round=best.round + 1,
+            num_steps=best.num_steps + 1,
             key=key,
         )
-
-
-class _Best(NamedTuple):
-    """The likeliest poses so far."""
-
-    T: Float[Array, "v D D"]
-    log_ratio: Float[Array, ""]
-    scale: Int[Array, ""]  # whose odds the first of them came from
-    settled: Bool[Array, ""]
-    idle: Int[Array, ""]  # rounds since the last gain
-    round: Int[Array, ""]
-    key: Key
-
-
-@eqx.filter_jit
-def _begun(graph: PoseGraph, key: Key | None) -> tuple[Float[Array, "s e"], _Best]:
-    """The odds at each scale, and the best of their trees.
-
-    Prior weights and short chains are hypotheses of their own.
-    """
-    graph = jax.lax.stop_gradient(graph)
-    odds = edge_log_odds(graph)
-    weights = jnp.concatenate([odds, graph.weight[None]])
-    T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(weights)
-    T = jnp.concatenate([T, _shortest(graph, odds)[None]])
-    best, ratio = _likeliest(graph, T)
-    none = jnp.asarray(0, jnp.int32)
-    return odds, _Best(
-        T=T[best],
-        log_ratio=ratio,
-        scale=jnp.minimum(best, len(odds) - 1),
-        settled=_is_settled(graph, odds, T[best]),
-        idle=none,
-        round=none,
-        key=jax.random.key(0) if key is None else key,
-    )
 
 
 @eqx.filter_jit
@@ -163,10 +167,14 @@ def _by_trees(graph: PoseGraph) -> AveragingSolution:
 
 
 @eqx.filter_jit
-def _believed(graph: PoseGraph, odds: Array, best: _Best) -> AveragingSolution:
-    graph = jax.lax.stop_gradient(graph)
-    belief = jnp.where(graph.weight > 0, jax.nn.sigmoid(odds[best.scale]), 0)
-    return solution(graph, best.T, edge_weight=belief, num_steps=best.round)
+def _searched(search: _Search, best: _Best) -> _Best:
+    return iterate(search, best, max_steps=search.rounds).state
+
+
+@eqx.filter_jit
+def _with_trust(graph: PoseGraph, best: _Best) -> AveragingSolution:
+    trust = jnp.where(graph.weight > 0, jax.nn.sigmoid(best.odds[best.scale]), 0)
+    return solution(graph, best.T, edge_weight=trust, num_steps=best.num_steps)
 
 
 def _likeliest(graph: PoseGraph, T: Float[Array, "m v D D"]) -> tuple[Array, Array]:
@@ -188,7 +196,7 @@ def _forest(graph: PoseGraph, odds: Array) -> trees.Forest:
 
 def _shortest(graph: PoseGraph, odds: Array) -> Array:
     """Poses along the most probable path from frame 0 to each frame, coarsest odds."""
-    doubt = jnp.clip(jax.nn.softplus(-odds[0]), 0.01, 10)  # -log of the belief
+    doubt = jnp.clip(jax.nn.softplus(-odds[0]), 0.01, 10)  # -log of the trust
     weight = jnp.where(graph.weight > 0, 1 / doubt, 0)
     return trees.shortest_paths(
         graph.edges, graph.T_i_j, weight, graph.num_poses
@@ -196,17 +204,17 @@ def _shortest(graph: PoseGraph, odds: Array) -> Array:
 
 
 def _is_settled(graph: PoseGraph, odds: Array, T: Array) -> Array:
-    """True if believed edges reach every frame and hardly any contradicts the poses.
+    """True if trusted edges reach every frame and hardly any contradicts the poses.
 
-    The edges believed at any one scale: noise may leave few at the finest.
+    The edges trusted at any one scale: noise may leave few at the finest.
     """
     placed = trees.components(graph.edges, graph.weight, graph.num_poses) == 0
 
     def at_scale(odds: Array) -> Array:
-        believed = jnp.where(odds > 0, graph.weight, 0)
-        component = trees.components(graph.edges, believed, graph.num_poses)
+        trusted = jnp.where(odds > 0, graph.weight, 0)
+        component = trees.components(graph.edges, trusted, graph.num_poses)
         reached = jnp.all((component == 0) | ~placed)
-        trusted = eqx.tree_at(lambda g: g.weight, graph, believed)
-        return reached & (agreed_share(trusted, T) > SETTLED)
+        part = eqx.tree_at(lambda g: g.weight, graph, trusted)
+        return reached & (agreed_share(part, T) > SETTLED)
 
     return jnp.any(jax.vmap(at_scale)(odds))

@@ -1,8 +1,8 @@
-"""Belief in edges from the motions alone: do cycles of three edges close?
+"""Trust in edges from the motions alone: do cycles of three edges close?
 
 If the other two edges of a cycle are right, the product of the motions is near the
 identity exactly when the third is right too. Each edge gathers, over all frames k, the
-evidence of the cycle i -> k -> j, weighted by the present belief that (i, k) and (k, j)
+evidence of the cycle i -> k -> j, weighted by the present trust that (i, k) and (k, j)
 are both right, for a few rounds. Weighting cycles by their other edges is the idea of
 cycle-edge message passing (Lerman and Shi 2021); the evidence here is a ratio of
 likelihoods that needs no noise level: if every scale of noise is as likely, the density
@@ -64,8 +64,8 @@ def edge_log_odds(graph: PoseGraph) -> Float[Array, "s e"]:
         gain = jnp.where(closed, ratio - 1, 0)
 
         def gather(_: Array, odds: Array) -> Array:
-            belief = jnp.append(jax.nn.sigmoid(odds), jnp.zeros((1,), odds.dtype))
-            said = jnp.log1p(belief[via_i] * belief[via_j] * gain)
+            trust = jnp.append(jax.nn.sigmoid(odds), jnp.zeros((1,), odds.dtype))
+            said = jnp.log1p(trust[via_i] * trust[via_j] * gain)
             return prior + jnp.sum(said, axis=1)
 
         return jax.lax.fori_loop(0, _ROUNDS, gather, prior)
