@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxreg.averaging import CycleConsensus, PoseGraphLM, average
-from jaxreg.averaging.start.cycles import NEUTRAL, edge_log_odds, judged
+from jaxreg.averaging.start.cycles import NEUTRAL, ROUNDS, edge_log_odds, judged
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_error, rotation_errors
 from tests.averaging.graphs import (
@@ -36,7 +36,7 @@ def naive_log_odds(X, edges, T, neutral) -> np.ndarray:
     low, high = np.sort(length)[[round(0.25 * (H - 1)), round(0.75 * (H - 1))]]
     scale = length[(length >= low) & (length <= high)].mean()
     odds = np.zeros(H)
-    for _ in range(6):
+    for _ in range(ROUNDS):
         belief, new = 1 / (1 + np.exp(-odds)), np.zeros(H)
         for e, (i, j) in enumerate(edges.tolist()):
             for k in range(len(X)):

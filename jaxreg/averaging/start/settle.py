@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.likelihood import DEVIATIONS, explained
+from jaxreg.averaging.likelihood import explained
 from jaxreg.averaging.measures import length_scale
+from jaxreg.averaging.start.cycles import ROUNDS
 from jaxreg.averaging.steps.iterate import nearby_rotation
 from jaxreg.averaging.steps.kernel_width import KERNEL_DEVIATIONS, gaussian_trust
 from jaxreg.geometry import lie
@@ -19,9 +20,8 @@ def settled(
 ) -> Float[Array, "v D D"]:
     """The poses after a few steps of averaging the motions that agree with them.
 
-    A chain of motions drifts; what agrees with it shows only then. The kernel is that
-    of the likeliest deviation: as many steps as it has octaves to fall. Dense over
-    frames.
+    A chain of motions drifts; what agrees with it shows only then. The kernel follows
+    the likeliest deviation. Dense over frames.
     """
     num, scale = graph.num_poses, length_scale(graph)
 
@@ -39,4 +39,4 @@ def settled(
         tangent = jax.scipy.linalg.cho_solve((factor, True), rhs)
         return nearby_rotation(product(lie.exp(tangent), T))
 
-    return jax.lax.fori_loop(0, len(DEVIATIONS), step, T_world_i)
+    return jax.lax.fori_loop(0, ROUNDS, step, T_world_i)
