@@ -5,6 +5,7 @@ from . import particle as particle
 from . import robust as robust
 from ._core.adjoint import ImplicitAdjoint as ImplicitAdjoint
 from ._core.adjoint import RecursiveCheckpointAdjoint as RecursiveCheckpointAdjoint
+from ._core.cache import cache as cache
 from ._core.status import Status as Status
 from .averaging import MCC as MCC
 from .averaging import AbstractAverager as AbstractAverager

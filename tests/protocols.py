@@ -143,6 +143,7 @@ PRIORS = [
 ]
 #: Public functions: the three verbs, and those that need no method.
 FUNCTIONS = {
+    "cache",
     "register",
     "average",
     "reconstruct",

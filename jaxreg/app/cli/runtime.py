@@ -1,13 +1,11 @@
 """What every command shares: device, screen, clock, the compilation cache."""
 
 import contextlib
-import os
 import re
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -129,29 +127,17 @@ def _use_device(kind: str) -> None:
 
 
 def keep_compiled_programs() -> None:
-    """Turns on JAX's cache of compiled programs, in the user's cache folder.
+    """Turns on `jaxreg.cache`; says in a line on standard error where that is unsafe.
 
-    They run as they lie there, so that the folder must belong to the user and nobody
-    else may write to it; else nothing is kept, which one line on standard error says.
-    `JAX_COMPILATION_CACHE_DIR` is honoured, then `XDG_CACHE_HOME`. Must be called
-    before the first compilation.
+    Must be called before the first compilation.
     """
     warnings.showwarning = _told_once(warnings.showwarning)
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(root) / "jaxreg"
-    with contextlib.suppress(OSError):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        folder.mkdir(mode=0o700, exist_ok=True)
-        if not _is_mine(folder):
-            sys.stderr.write(
-                f"jaxreg: {folder}: others may write there, compiled programs are not "
-                "kept. Remove it, or make it yours alone.\n"
-            )
-            return
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    try:
+        jaxreg.cache()
+    except ValueError as err:
+        sys.stderr.write(f"jaxreg: {err}\n")
+    except OSError:  # no home, or nothing can be made there: it is done without
+        pass
 
 
 def _told_once(show: Callable[..., None]) -> Callable[..., None]:
@@ -170,13 +156,6 @@ def _told_once(show: Callable[..., None]) -> Callable[..., None]:
             )
 
     return once
-
-
-def _is_mine(folder: Path) -> bool:
-    if not hasattr(os, "getuid"):  # Windows: profiles are their user's
-        return True
-    found = folder.stat()
-    return found.st_uid == os.getuid() and not found.st_mode & 0o022
 
 
 class _CompileClock:

@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import pytest
 
+import jaxreg
 from jaxreg.app.cli.runtime import keep_compiled_programs
 
 
@@ -30,14 +31,29 @@ def test_a_folder_that_others_may_write_to_is_not_used(
     assert "others may write there" in capsys.readouterr().err
     folder.chmod(0o700)
     monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
-    keep_compiled_programs()
+    with pytest.raises(ValueError, match="others may write there"):
+        jaxreg.cache()
     assert used == {}
+
+
+def test_programs_are_kept_where_one_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    used: dict[str, object] = {}
+    monkeypatch.setattr(jax.config, "update", used.__setitem__)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "named"))
+    assert jaxreg.cache() == tmp_path / "named"
+    assert used == {}
+    assert jaxreg.cache(tmp_path / "a" / "given") == tmp_path / "a" / "given"
+    assert used["jax_compilation_cache_dir"] == str(tmp_path / "a" / "given")
+    assert (tmp_path / "a" / "given").is_dir()
 
 
 def test_damaged_programs_are_compiled_anew_and_told_of_once(tmp_path: Path):
     code = """
 import pathlib, sys
 import jax, jax.numpy as jnp
+import jaxreg
 from jaxreg.app.cli.runtime import keep_compiled_programs
 
 keep_compiled_programs()
