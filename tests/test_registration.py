@@ -254,6 +254,46 @@ def test_a_symmetric_object_is_ambiguous_and_its_modes_are_the_symmetrys(shape):
         assert abs(turned[2, 2]) > 0.99
 
 
+def _faces(rng: np.random.Generator, num: int, *sides: float) -> np.ndarray:
+    """Points on the surface of a box."""
+    size = np.array(sides)
+    face = rng.choice(3, num, p=(1 / size) / np.sum(1 / size))
+    points = rng.uniform(-1, 1, (num, 3))
+    points[np.arange(num), face] = rng.choice([-1, 1], num)
+    return points * size
+
+
+def _ball(rng: np.random.Generator, num: int) -> np.ndarray:
+    points = rng.standard_normal((num, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def _ring(rng: np.random.Generator, num: int) -> np.ndarray:
+    u, v = rng.uniform(0, 2 * np.pi, (2, num))
+    r = 1 + 0.4 * np.cos(v)
+    return np.stack([r * np.cos(u), r * np.sin(u), 0.4 * np.sin(v)], axis=1)
+
+
+SHAPES = {
+    "sphere": (_ball, Status.AMBIGUOUS),
+    "torus": (_ring, Status.AMBIGUOUS),
+    "plane": (lambda rng, num: _faces(rng, num, 1, 1, 1e-6), Status.AMBIGUOUS),
+    "cube": (lambda rng, num: _faces(rng, num, 1, 1, 1), Status.AMBIGUOUS),
+    "box": (lambda rng, num: _faces(rng, num, 1, 1.5, 2), Status.AMBIGUOUS),
+    "noise": (lambda rng, num: rng.uniform(-1, 1, (num, 3)), Status.LOW_OVERLAP),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_what_has_no_one_answer_says_so(name):
+    shape, expected = SHAPES[name]
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        source, target = move(motion(seed, 3), shape(rng, N)), shape(rng, M)
+        sol = jr.register(source, target.astype(np.float32), key=jax.random.key(seed))
+        assert int(sol.status) == expected
+
+
 CUBE = np.ones((5, 3), np.float32)
 
 

@@ -9,7 +9,9 @@ by a mixture, fitted by maximum likelihood (expectation maximisation):
     p(u, c) = w N(u; 0, s^2) f_k(c) + (1 - w) / 6 f_0(c)
 
 points that lie on the surface, with a width s and a concentration k of their normals,
-and points that are anywhere beside it. Directions count alike however many points show
+and points that are anywhere beside it. (Where both clouds fill a volume, chance alone
+puts points near the other's samples, and 1 / 6 is more within a spacing and less
+beyond: `jaxreg.matching.chance`.) Directions count alike however many points show
 them: the ground is most of what a lidar sees, and it fits nearly everywhere. Two
 numbers of both ways are left,
 
@@ -43,6 +45,7 @@ from jaxreg._core.arrays import on_both
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import PointCloud, levelled
 from jaxreg.geometry import lie
+from jaxreg.matching.chance import ZONE, near_by_chance
 from jaxreg.matching.problem import Match, Problem, match
 from jaxreg.matching.slippage import Grip
 from jaxreg.neighbours import AbstractIndex, BruteForce
@@ -57,8 +60,6 @@ NO_EVIDENCE = -100.0
 # The regression; `near` weighs like 25 independent places of which 95 % of those of
 # a right pose are near and 80 % of those of a wrong one.
 _GAIN, _NEAR, _OFFSET = 2.3, 38.0, 34.8
-# Heights that are beside a surface, in local spacings.
-_ZONE = 3.0
 # A gain so small is none: the mixture found nothing on the surface.
 _LEAST_GAIN = 0.05
 # Steps of the mixture, and the bounds of its width and concentration: exact data have
@@ -119,11 +120,14 @@ class Witness(eqx.Module):
         problems: of the source on the target, and of the target on the source.
         spacings: of the samples around each point, of the source and of the target.
         shares: weights by which the directions of either's normals count alike.
+        chance: share of the heights beside that is near by chance, of the cloud that
+            has less of it.
     """
 
     problems: tuple[Problem, Problem]
     spacings: tuple[Float[Array, " n"], Float[Array, " n"]]
     shares: tuple[Float[Array, " n"], Float[Array, " n"]]
+    chance: Scalar
 
     @classmethod
     def of(
@@ -144,6 +148,10 @@ class Witness(eqx.Module):
             ),
             (source.spacing, target.spacing),
             on_both(_balanced, source, target),
+            jnp.minimum(
+                near_by_chance(source, source_index),
+                near_by_chance(target, target_index),
+            ),
         )
 
     @classmethod
@@ -161,8 +169,9 @@ class Witness(eqx.Module):
     ) -> Evidence:
         """Of each pose in use, one after another; `NO_EVIDENCE` of the others."""
         (there, back), (own, other) = self.problems, self.spacings
-        forward = there, T_target_source, own, other, self.shares[0]
-        backward = back, lie.inverse(T_target_source), other, own, self.shares[1]
+        T_source_target, chance = lie.inverse(T_target_source), self.chance
+        forward = there, T_target_source, own, other, self.shares[0], chance
+        backward = back, T_source_target, other, own, self.shares[1], chance
 
         def ways(way: tuple) -> _Way:
             problem, T, *rest = way
@@ -213,7 +222,7 @@ class _Beside(eqx.Module):
         height = jnp.where(flat, height, jnp.sqrt(found.sq_residual))
         along = jnp.where(flat, along, 0)
         mask = found.mask & (reach > 0)
-        mask = mask & (along < reach**2) & (height < _ZONE * reach)
+        mask = mask & (along < reach**2) & (height < ZONE * reach)
         log_cosine = 0.5 * jnp.log(jnp.maximum(found.agreement, 1e-6))
         height = height / jnp.where(reach > 0, reach, 1)
         return cls(height, reach, log_cosine, flat, mask)
@@ -227,16 +236,20 @@ class _Mixture(eqx.Module):
         width: of their heights in spacings, s.
         alike: concentration of their normals, k: density over that of directions at
             random is |cos|^k over its mean.
+        chance: share of the points anywhere beside that is within a spacing.
         d: dimension.
     """
 
     share: Scalar
     width: Scalar
     alike: Scalar
+    chance: Scalar
     d: int = eqx.field(static=True)
 
     @classmethod
-    def fitted(cls, beside: _Beside, balance: Float[Array, " n"], d: int) -> "_Mixture":
+    def fitted(
+        cls, beside: _Beside, balance: Float[Array, " n"], chance: Scalar, d: int
+    ) -> "_Mixture":
         """By expectation maximisation."""
         step = max(1, len(balance) // _FIT_POINTS)
         beside, balance = jax.tree.map(lambda x: x[::step], (beside, balance))
@@ -246,7 +259,7 @@ class _Mixture(eqx.Module):
         half = (d - 1) / 2
 
         def improve(_: Array, now: Array) -> Array:
-            mixture = cls(now[0], now[1], now[2], d)
+            mixture = cls(now[0], now[1], now[2], chance, d)
             part = weight * jax.nn.sigmoid(mixture.log_odds(beside))
             some = jnp.maximum(jnp.sum(part), tiny)
             sq_width = jnp.sum(part * beside.height**2) / some
@@ -258,14 +271,16 @@ class _Mixture(eqx.Module):
 
         start = jnp.asarray(_START, weight.dtype)
         share, width, alike = lax.fori_loop(0, _FIT_STEPS, improve, start)
-        return cls(share, width, alike, d)
+        return cls(share, width, alike, chance, d)
 
     def log_odds(self, beside: _Beside) -> Float[Array, " n"]:
         """Of each point lying on the surface."""
         k, half = self.alike, self.d / 2
         log_mean = gammaln((k + 1) / 2) - gammaln(k / 2 + half)
         log_mean = log_mean + gammaln(half) - gammaln(0.5)
-        log_scale = jnp.log(2 * _ZONE / (math.sqrt(2 * math.pi) * self.width))
+        beyond = (1 - self.chance) / (2 * (ZONE - 1))
+        anywhere = jnp.where(beside.height < 1, self.chance / 2, beyond)
+        log_scale = -jnp.log(math.sqrt(2 * math.pi) * self.width * anywhere)
         log_share = jnp.log(self.share) - jnp.log1p(-self.share)
         normals = jnp.where(beside.flat, k * beside.log_cosine - log_mean, 0)
         return log_share + log_scale - (beside.height / self.width) ** 2 / 2 + normals
@@ -288,11 +303,12 @@ def _one_way(
     own: Float[Array, " n"],
     other: Float[Array, " m"],
     balance: Float[Array, " n"],
+    chance: Scalar,
 ) -> _Way:
     """What the source of a problem says of a pose."""
     found = match(problem, T_target_source)
     beside = _Beside.of(found, own, other)
-    mixture = _Mixture.fitted(beside, balance, problem.source.shape[0])
+    mixture = _Mixture.fitted(beside, balance, chance, problem.source.shape[0])
     gain, on = mixture.gain(beside, balance)
     near = beside.mask & (beside.height < 1)
     moved = found.rotated + lie.translation(T_target_source)[:, None]

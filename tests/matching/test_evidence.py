@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from evidence_clouds import EYE, SPACING, UP, as_cloud, floor, witness
-from helpers import motion
+from helpers import blob, half_noise, motion
 from scipy.spatial import KDTree
 from scipy.stats import norm
 
@@ -103,6 +103,20 @@ def test_wrong_poses_have_little_evidence(scans):
     for seed in range(5):
         T = jnp.asarray(motion(seed, 3, angle=1.0, shift=0.0), jnp.float32)
         assert float(told.of_pose(T).log_evidence) < 0
+
+
+def test_noise_on_noise_is_chance_and_a_surface_in_noise_is_not():
+    def told(clouds: list[np.ndarray]) -> float:
+        some = [
+            thin(jnp.asarray(x, jnp.float32), jnp.ones(len(x), bool), 600, 10)
+            for x in clouds
+        ]
+        return float(witness(*some).of_pose(EYE).log_evidence)
+
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        assert told([rng.uniform(-1, 1, (600, 3)) for _ in range(2)]) < 0
+        assert told([half_noise(blob(600, 3, seed + 4 * k), k) for k in (0, 1)]) > 1
 
 
 def _oracle(source: PointCloud, target: PointCloud) -> tuple[float, float]:
