@@ -47,15 +47,15 @@ def near_by_chance(cloud: PointCloud, index: AbstractIndex) -> Scalar:
     surfaces = jnp.asarray(OF_SURFACES, dtype)
     if cloud.points.shape[1] != 3 or cloud.spacing is None:
         return surfaces
-    some = cloud.of_rows(slice(None, None, max(1, len(cloud.mask) // _SAMPLES)))
+    every = slice(None, None, max(1, len(cloud.mask) // _SAMPLES))
+    some, spacing = cloud.of_rows(every), cloud.spacing[every]
     step = jnp.arange(len(some.mask), dtype=dtype) * _STEP
     height = ZONE * (2 * (step - jnp.floor(step)) - 1)
-    assert some.spacing is not None
-    away = (height * some.spacing)[:, None] * some.normals
+    away = (height * spacing)[:, None] * some.normals
     flat = some.mask & jnp.any(some.normals != 0, axis=1)
     room = PointCloud(some.points + away, some.normals, flat)
     found = match(Problem.of(room, cloud, index), jnp.eye(4, dtype=dtype))
-    reach = jnp.maximum(some.spacing, cloud.spacing[found.row])
+    reach = jnp.maximum(spacing, cloud.spacing[found.row])
     over = jnp.abs(found.plane_residual)
     along = sum_rows(found.residual**2) - over**2
     beside = flat & (along < reach**2) & (over < ZONE * reach)
