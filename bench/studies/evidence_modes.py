@@ -75,8 +75,10 @@ def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, jax.Array]:
     (there, back), (own, other) = witness.problems, witness.spacings
 
     def of_pose(T: jax.Array) -> tuple[jax.Array, jax.Array]:
-        to = evidence._one_way(there, T, own, other, witness.shares[0])
-        fro = evidence._one_way(back, lie.inverse(T), other, own, witness.shares[1])
+        to = evidence._one_way(there, T, own, other, witness.shares[0], witness.chance)
+        fro = evidence._one_way(
+            back, lie.inverse(T), other, own, witness.shares[1], witness.chance
+        )
         gain = jnp.maximum((to.gain + fro.gain) / 2, evidence._LEAST_GAIN)
         return jnp.log(gain), jnp.sqrt(to.near * fro.near)
 

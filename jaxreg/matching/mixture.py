@@ -1,0 +1,132 @@
+"""Points that lie on a surface, and points anywhere beside it: a mixture, and its fit.
+
+The formula is that of `jaxreg.matching.evidence`.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.special import gammaln
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core.typing import Scalar
+from jaxreg.matching.chance import ZONE
+from jaxreg.matching.problem import Match
+
+
+# Steps of the mixture, and the bounds of its width and concentration: exact data have
+# no width, normals that tell agree within 35 degrees and are known to 4.
+_FIT_STEPS, _LEAST_WIDTH, _LEAST_SHARE = 16, 0.01, 1e-3
+_LEAST_ALIKE, _MOST_ALIKE = 4.0, 200.0
+_START = 0.5, 0.2, 4.0
+# Points that the mixture is fitted to, spread over the cloud.
+_FIT_POINTS = 1024
+
+
+class Beside(eqx.Module):
+    """Source points beside the target: heights in local spacings, and normals.
+
+    Attributes:
+        height: over the plane of the closest sample, in spacings; where either has no
+            normal the distance to the sample.
+        reach: the spacing there.
+        log_cosine: between the normals.
+        flat: whether both have one.
+        mask: which are beside.
+    """
+
+    height: Float[Array, " n"]
+    reach: Float[Array, " n"]
+    log_cosine: Float[Array, " n"]
+    flat: Bool[Array, " n"]
+    mask: Bool[Array, " n"]
+
+    @classmethod
+    def of(
+        cls, found: Match, own: Float[Array, " n"], other: Float[Array, " m"]
+    ) -> "Beside":
+        """Of a match, and the spacings of both clouds."""
+        reach = jnp.maximum(own, other[found.row])
+        flat = jnp.any(found.normal != 0, axis=0)
+        flat = flat & jnp.any(found.source_normal != 0, axis=0)
+        height = jnp.where(flat, jnp.abs(found.plane_residual), 0)
+        along = found.sq_residual - height**2
+        height = jnp.where(flat, height, jnp.sqrt(found.sq_residual))
+        along = jnp.where(flat, along, 0)
+        mask = found.mask & (reach > 0)
+        mask = mask & (along < reach**2) & (height < ZONE * reach)
+        log_cosine = 0.5 * jnp.log(jnp.maximum(found.agreement, 1e-6))
+        height = height / jnp.where(reach > 0, reach, 1)
+        return cls(height, reach, log_cosine, flat, mask)
+
+
+class Mixture(eqx.Module):
+    """Points on the surface and points anywhere beside it.
+
+    Attributes:
+        share: of those on the surface, w.
+        width: of their heights in spacings, s.
+        alike: concentration of their normals, k: density over that of directions at
+            random is |cos|^k over its mean.
+        chance: share of the points anywhere beside that is within a spacing.
+        d: dimension.
+    """
+
+    share: Scalar
+    width: Scalar
+    alike: Scalar
+    chance: Scalar
+    d: int = eqx.field(static=True)
+
+    @classmethod
+    def fitted(
+        cls, beside: Beside, balance: Float[Array, " n"], chance: Scalar, d: int
+    ) -> "Mixture":
+        """By expectation maximisation."""
+        step = max(1, len(balance) // _FIT_POINTS)
+        beside, balance = jax.tree.map(lambda x: x[::step], (beside, balance))
+        weight = jnp.where(beside.mask, balance, 0)
+        tiny = jnp.finfo(weight.dtype).tiny
+        total = jnp.maximum(jnp.sum(weight), tiny)
+        half = (d - 1) / 2
+
+        def improve(_: Array, now: Array) -> Array:
+            mixture = cls(now[0], now[1], now[2], chance, d)
+            part = weight * jax.nn.sigmoid(mixture.log_odds(beside))
+            some = jnp.maximum(jnp.sum(part), tiny)
+            sq_width = jnp.sum(part * beside.height**2) / some
+            apart = jnp.sum(part * -beside.log_cosine) / some
+            alike = half / jnp.maximum(apart, half / (2 * _MOST_ALIKE)) - half
+            share = jnp.clip(some / total, _LEAST_SHARE, 1 - _LEAST_SHARE)
+            width = jnp.clip(jnp.sqrt(sq_width), _LEAST_WIDTH, 1)
+            return jnp.stack([share, width, jnp.clip(alike, _LEAST_ALIKE, _MOST_ALIKE)])
+
+        start = jnp.asarray(_START, weight.dtype)
+        share, width, alike = lax.fori_loop(0, _FIT_STEPS, improve, start)
+        return cls(share, width, alike, chance, d)
+
+    def log_odds(self, beside: Beside) -> Float[Array, " n"]:
+        """Of each point lying on the surface."""
+        k, half = self.alike, self.d / 2
+        log_mean = gammaln((k + 1) / 2) - gammaln(k / 2 + half)
+        log_mean = log_mean + gammaln(half) - gammaln(0.5)
+        beyond = (1 - self.chance) / (2 * (ZONE - 1))
+        anywhere = jnp.where(beside.height < 1, self.chance / 2, beyond)
+        log_scale = -jnp.log(math.sqrt(2 * math.pi) * self.width * anywhere)
+        log_share = jnp.log(self.share) - jnp.log1p(-self.share)
+        normals = jnp.where(beside.flat, k * beside.log_cosine - log_mean, 0)
+        return log_share + log_scale - (beside.height / self.width) ** 2 / 2 + normals
+
+    def gain(
+        self, beside: Beside, balance: Float[Array, " n"]
+    ) -> tuple[Scalar, Bool[Array, " n"]]:
+        """Mean log-likelihood over that of chance, and the points on the surface."""
+        odds = self.log_odds(beside)
+        weight = jnp.where(beside.mask, balance, 0)
+        gain = jax.nn.softplus(odds) + jnp.log1p(-self.share)
+        tiny = jnp.finfo(weight.dtype).tiny
+        mean = jnp.sum(weight * gain) / jnp.maximum(jnp.sum(weight), tiny)
+        return mean, beside.mask & (odds > 0)
