@@ -9,9 +9,10 @@ from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxreg._core.checks import as_float_array, check_mask, shown
+from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.geometry.nearest_rotation import nearest_rotation
 from jaxreg.graph.pose_graph import (
@@ -26,10 +27,10 @@ Align = Literal["first", "best", "none"]
 
 
 def align_poses(
-    T_world_i: Float[Array, "v D D"],
-    T_true_i: Float[Array, "v D D"],
+    T_world_i: ArrayLike,
+    T_true_i: ArrayLike,
     align: Align = "first",
-    mask: Bool[Array, " v"] | None = None,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, "v D D"]:
     """The estimate in the frame of the truth.
 
@@ -89,10 +90,10 @@ def _checked(
 
 
 def rotation_errors(
-    T_world_i: Float[Array, "v D D"],
-    T_true_i: Float[Array, "v D D"],
+    T_world_i: ArrayLike,
+    T_true_i: ArrayLike,
     align: Align = "first",
-    mask: Bool[Array, " v"] | None = None,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, " v"]:
     """The angle between estimated and true rotation of each frame, in radians."""
     return _rotation_errors(*_checked(T_world_i, T_true_i, align, mask))
@@ -108,10 +109,10 @@ def _rotation_errors(
 
 
 def translation_errors(
-    T_world_i: Float[Array, "v D D"],
-    T_true_i: Float[Array, "v D D"],
+    T_world_i: ArrayLike,
+    T_true_i: ArrayLike,
     align: Align = "first",
-    mask: Bool[Array, " v"] | None = None,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, " v"]:
     """The distance between estimated and true translation of each frame."""
     return _translation_errors(*_checked(T_world_i, T_true_i, align, mask))
@@ -127,10 +128,10 @@ def _translation_errors(
 
 
 def rotation_error(
-    T_world_i: Float[Array, "v D D"],
-    T_true_i: Float[Array, "v D D"],
+    T_world_i: ArrayLike,
+    T_true_i: ArrayLike,
     align: Align = "first",
-    mask: Bool[Array, " v"] | None = None,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, ""]:
     """e_R of the MCC paper: the mean over the frames in `mask`, in radians.
 
@@ -146,10 +147,10 @@ def rotation_error(
 
 
 def translation_error(
-    T_world_i: Float[Array, "v D D"],
-    T_true_i: Float[Array, "v D D"],
+    T_world_i: ArrayLike,
+    T_true_i: ArrayLike,
     align: Align = "first",
-    mask: Bool[Array, " v"] | None = None,
+    mask: ArrayLike | None = None,
 ) -> Float[Array, ""]:
     """e_t of the MCC paper: the mean over the frames in `mask`, in their unit."""
     checked = _checked(T_world_i, T_true_i, align, mask)
@@ -161,9 +162,7 @@ def _mean(x: Array, mask: Array) -> Array:
     return jnp.sum(jnp.where(mask, x, 0)) / count
 
 
-def chordal_objective(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
-) -> Float[Array, ""]:
+def chordal_objective(graph: PoseGraph, T_world_i: ArrayLike) -> Float[Array, ""]:
     """SE-Sync's objective F of poses, without a factor 1/2.
 
     Sum over the edges of kappa |R_j - R_i R_i_j|_F^2 + tau |t_j - t_i - R_i t_i_j|^2.

@@ -201,13 +201,13 @@ def check_method(found: object, contract: Any) -> None:
 
 def _check_scalars(part: Any) -> None:
     for field in dataclasses.fields(part):
-        found = getattr(part, field.name)
+        found: Any = getattr(part, field.name)
         if dataclasses.is_dataclass(found) and not isinstance(found, type):
             _check_scalars(found)
-        elif field.metadata.get(TRACED) and np.ndim(found):
+        elif field.metadata.get(TRACED) and found is not None and found.ndim:
             raise ValueError(
                 f"{type(part).__name__}: {field.name}: wanted one number, found shape "
-                f"{np.shape(found)}. Use jax.vmap over the call."
+                f"{found.shape}. Use jax.vmap over the call."
             )
 
 

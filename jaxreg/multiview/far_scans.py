@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxreg._core.checks import as_host_numbers
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution
@@ -39,9 +40,22 @@ class FarScans:
         if viewpoints is None or not self.moved:
             return viewpoints
         if not isinstance(viewpoints, list | tuple):
-            return np.asarray(viewpoints, np.float64) - self.origin
-        pairs = zip(viewpoints, self.origin, strict=False)
-        return [None if x is None else np.asarray(x) - o for x, o in pairs]
+            return self._less_origin(as_host_numbers(viewpoints, "viewpoints"))
+        if len(viewpoints) != len(self.origin):
+            return viewpoints
+        known = [x is not None for x in viewpoints]
+        rows = [
+            as_host_numbers(x, f"viewpoints[{i}]") if known[i] else self.origin[i]
+            for i, x in enumerate(viewpoints)
+        ]
+        if any(x.shape != self.origin[0].shape for x in rows):
+            return viewpoints
+        moved = self._less_origin(np.stack(rows))
+        return [x if known[i] else None for i, x in enumerate(moved)]
+
+    def _less_origin(self, x: np.ndarray) -> np.ndarray:
+        """Places of the scans; those of another number are refused by who gets them."""
+        return x - self.origin if x.shape == self.origin.shape else x
 
     def positions(self, positions: ScanPositions | None) -> ScanPositions | None:
         """With antennas in the moved frames."""
@@ -52,7 +66,7 @@ class FarScans:
                 "positions: scans far from their origins were taken from elsewhere: "
                 "wanted ScanPositions(..., antenna=...) in each scan's own frame."
             )
-        antenna = np.asarray(positions.antenna, np.float64) - self.origin
+        antenna = self._less_origin(np.asarray(positions.antenna, np.float64))
         return dataclasses.replace(positions, antenna=antenna)
 
     def previous(self, previous: object) -> object:

@@ -4,13 +4,14 @@ Cast to float32 they would be rounded to half a metre. They are moved to their m
 before, in float64 on the host, and the poses that are found are moved back there.
 """
 
+import contextlib
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from jaxreg._core.checks import as_host_array
+from jaxreg._core.checks import as_host_array, as_host_numbers
 from jaxreg._core.typing import ArrayLike
 from jaxreg.batching.padding import is_list_of_clouds
 from jaxreg.particle import AbstractSearch, GivenParticles, PartialPose
@@ -54,9 +55,15 @@ def near_origin(points: object, mask: object, name: str) -> Moved:
         origins = [zero if x.origin is None else x.origin for x in each]
         return Moved([x.points for x in each], np.stack(origins))
     found = as_host_array(points, name)
-    valid = np.ones(found.shape[:-1], bool) if mask is None else np.asarray(mask, bool)
     exact = found.dtype == np.float64 or found.dtype.kind in "iu"
-    if not exact or found.ndim < 2 or valid.shape != found.shape[:-1]:
+    if not exact or found.ndim < 2:
+        return Moved(points, None)
+    valid = np.ones(found.shape[:-1], bool)
+    if mask is not None:
+        with contextlib.suppress(ValueError, TypeError):
+            valid = as_host_array(mask, f"{name}_mask").astype(bool)
+    # One that does not fit is refused where both clouds are checked.
+    if valid.shape != found.shape[:-1]:
         return Moved(points, None)
     origin = _middles(found, valid)
     if not np.any(origin):
@@ -95,8 +102,14 @@ def moved_guess(
     """A guess between the frames of the input as one between those of the search."""
     if init is None or (source.origin is None and target.origin is None):
         return init
-    T = np.asarray(as_host_array(init, "init"), np.float64)
-    return pose_moved(T, *_origins(source, target, T.shape[-1] - 1))
+    T = as_host_numbers(init, "init")
+    one = source.origin if source.origin is not None else target.origin
+    assert one is not None
+    d = one.shape[-1]
+    # What does not fit is refused by who looks for motions.
+    if T.shape[-2:] != (d + 1, d + 1) or T.shape[:-2] not in ((), one.shape[:-1]):
+        return init
+    return pose_moved(T, *_origins(source, target, d))
 
 
 def moved_back(

@@ -14,6 +14,7 @@ import numpy as np
 
 import jaxreg as jr
 from jaxreg import averaging, io, metrics, particle, robust
+from jaxreg.particle import dynamics
 from jaxreg.testing import problems
 
 
@@ -119,7 +120,7 @@ _NEEDED: dict[type, dict[str, Any]] = {
 }
 # Set by the methods themselves.
 _INTERNAL = {"frames"}
-_MODULES = (jr, robust, particle, particle.dynamics, averaging)
+_MODULES = (jr, robust, particle, dynamics, averaging)
 
 
 def _classes() -> list[type]:
@@ -195,6 +196,10 @@ def _registrations() -> Iterator[Call]:
     numbers = {"max_correspondence_distance": 9.0, "width_end": 1.0, "tolerance": 1e-4}
     local = {**good, **masks, "key": KEY, "batch_size": 1}
     yield Call("register", _locally, {**local, **numbers}, untrue)
+    far = {"source": SOURCE + np.float64(5e5), "target": TARGET - np.float64(3e6)}
+    far["init"] = np.eye(4)
+    far["init"][:3, 3] = -3.5e6
+    yield Call("register far away", _locally, {**local, **far, **numbers}, untrue)
     by = {"method": _icp(), "init": None, "progress": None}
     yield Call("register by", jr.register, {**local, **by}, untrue, dear=True)
     search = jr.ParticleFilter(**_SEARCH)
@@ -268,6 +273,11 @@ def _reconstructions() -> Iterator[Call]:
         "on_pairs": None,
     }
     yield Call("reconstruct", jr.reconstruct, good, untrue, dear=True)
+    away = [scan + np.float64(1e6) for scan in scans]
+    places = jr.ScanPositions(np.zeros((3, 3)), antenna=np.full((3, 3), 1e6 + 1))
+    far = {**good, "scans": away, "method": jr.ParticleFilter(**_SEARCH)}
+    far |= {"positions": places, "viewpoints": np.full((3, 3), 1e6 - 9)}
+    yield Call("reconstruct far away", jr.reconstruct, far, untrue, dear=True)
     padded = {**good, "scans": np.stack([SOURCE] * 3), "mask": np.ones((3, 46), bool)}
     del padded["viewpoints"]
     yield Call("reconstruct of an array", jr.reconstruct, padded, untrue, dear=True)
