@@ -202,13 +202,14 @@ def check_method(found: object, contract: Any) -> None:
 def _check_scalars(part: Any) -> None:
     for field in dataclasses.fields(part):
         found: Any = getattr(part, field.name)
-        if dataclasses.is_dataclass(found) and not isinstance(found, type):
+        if field.metadata.get(TRACED):
+            if found is not None and found.ndim:
+                raise ValueError(
+                    f"{type(part).__name__}: {field.name}: wanted one number, found "
+                    f"shape {found.shape}. Use jax.vmap over the call."
+                )
+        elif dataclasses.is_dataclass(found) and not isinstance(found, type):
             _check_scalars(found)
-        elif field.metadata.get(TRACED) and found is not None and found.ndim:
-            raise ValueError(
-                f"{type(part).__name__}: {field.name}: wanted one number, found shape "
-                f"{found.shape}. Use jax.vmap over the call."
-            )
 
 
 def told(found: object, contract: type) -> str:
