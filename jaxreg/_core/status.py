@@ -12,7 +12,7 @@ class Status(enum.IntEnum):
     """The outcome of a solve. Compare with `sol.status == Status.CONVERGED`.
 
     >>> import jaxreg as jr
-    >>> print(jr.Status(1).name, "-", jr.Status(1).advice)
+    >>> print(jr.Status(1), "-", jr.Status(1).advice)
     MAX_STEPS - The steps ran out before the answer stood still. Raise `max_steps` \
 (`average --budget`), or start nearer to the solution.
     """
@@ -28,6 +28,9 @@ class Status(enum.IntEnum):
     DIVERGED = 8
     UNIT_DIFFERS = 9
     NO_AGREEMENT = 10
+
+    def __str__(self) -> str:
+        return self.name
 
     @property
     def advice(self) -> str:
