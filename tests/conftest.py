@@ -13,6 +13,8 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 os.environ.setdefault("MPLBACKEND", "agg")
+# Compiling is what most tests cost; `fully_compiled` is for those that compute.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 
 def pytest_collection_finish() -> None:
@@ -33,7 +35,7 @@ def _bounded_number_of_live_programs() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def quickly_compiled() -> Iterator[None]:
-    """For modules of small problems, whose time is that of compiling."""
-    with switched_on("jax_disable_most_optimizations"):
+def fully_compiled() -> Iterator[None]:
+    """For modules of large problems, whose time is that of computing."""
+    with switched_on("jax_disable_most_optimizations", to=False):
         yield

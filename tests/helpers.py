@@ -25,17 +25,18 @@ def data_dir(*parts: str) -> Path:
 
 
 @contextmanager
-def switched_on(*names: str) -> Iterator[None]:
-    """With settings of JAX that are off by default."""
+def switched_on(*names: str, to: bool = True) -> Iterator[None]:
+    """With settings of JAX that are off by default, or off with `to=False`."""
     import jax
 
+    before = {name: jax.config.values[name] for name in names}
     for name in names:
-        jax.config.update(name, True)
+        jax.config.update(name, to)
     try:
         yield
     finally:
-        for name in names:
-            jax.config.update(name, False)
+        for name, value in before.items():
+            jax.config.update(name, value)
 
 
 def blob(n: int, d: int, seed: int = 0) -> np.ndarray:

@@ -22,9 +22,8 @@ POINTS = jr.PointToPoint()
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _quickly_compiled() -> Iterator[None]:
-    """In double precision; these programs run once."""
-    with switched_on("jax_enable_x64", "jax_disable_most_optimizations"):
+def _double() -> Iterator[None]:
+    with switched_on("jax_enable_x64"):
         yield
 
 

@@ -15,9 +15,6 @@ from jaxreg.cloud import (
 )
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N = 6000
 _thin = jax.jit(thin, static_argnums=2)
 _without_noise = jax.jit(without_noise)

@@ -11,7 +11,7 @@ from types import ModuleType
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import blob, switched_on
+from helpers import blob
 
 import jaxreg as jr
 from jaxreg.cloud import OTHER_UNIT
@@ -68,9 +68,8 @@ def test_the_code_of_extending_keeps_its_promises(monkeypatch):
     module = ModuleType("extending")  # of which classes can be pickled
     monkeypatch.setitem(sys.modules, "extending", module)
     names = vars(module)
-    with switched_on("jax_disable_most_optimizations"):
-        for block in blocks:
-            exec(compile(block, "extending.md", "exec"), names)
+    for block in blocks:
+        exec(compile(block, "extending.md", "exec"), names)
     # Checked, and of use: every part runs in a method.
     checks = {name for name in names if name.startswith("check_")}
     assert checks == {

@@ -8,7 +8,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import switched_on
 
 
 NOTEBOOK = Path(__file__).parents[1] / "notebooks" / "05_gradients.ipynb"
@@ -21,14 +20,13 @@ def names() -> Iterator[dict[str, Any]]:
 
     document = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
     found: dict[str, Any] = {}
-    with switched_on("jax_disable_most_optimizations"):
-        for cell in document["cells"]:
-            source = "".join(cell["source"])
-            if cell["cell_type"] == "code" and "plt.show()" not in source:
-                exec(compile(source, NOTEBOOK.name, "exec"), found)
-            if "parameters" in cell["metadata"].get("tags", []):
-                exec(document["metadata"]["jaxreg_quick"], found)
-        yield found
+    for cell in document["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "code" and "plt.show()" not in source:
+            exec(compile(source, NOTEBOOK.name, "exec"), found)
+        if "parameters" in cell["metadata"].get("tags", []):
+            exec(document["metadata"]["jaxreg_quick"], found)
+    yield found
     plt.close("all")
 
 

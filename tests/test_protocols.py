@@ -51,7 +51,7 @@ from jaxreg.testing.promises import (
 @pytest.fixture(autouse=True, scope="module")
 def _strict() -> Iterator[None]:
     """What is not a number raises. Compiled in a hurry: these programs run once."""
-    with switched_on("jax_debug_nans", "jax_disable_most_optimizations"):
+    with switched_on("jax_debug_nans"):
         yield
 
 

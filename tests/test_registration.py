@@ -19,8 +19,6 @@ from jaxreg.registrar import AbstractRegistrar
 from jaxreg.robust import L1
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
 KEY = jax.random.key(0)
 
 

@@ -14,9 +14,6 @@ from jaxreg import Status
 from jaxreg.registration import many
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 @pytest.fixture
 def compiled():
     """Names of functions, as they are compiled."""

@@ -29,9 +29,6 @@ from jaxreg.metrics import rotation_error, translation_error
 from tests.averaging.graphs import random_graph
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N, H = 12, 60
 METHODS = {
     "tree": SpanningTree(),

@@ -16,9 +16,6 @@ from tests.averaging.graphs import (
 )
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N, H = 16, 100
 log_odds = jax.jit(edge_log_odds)
 

@@ -12,9 +12,6 @@ from tests.averaging.graphs import motions, rotations
 from tests.helpers import data_dir
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 LAP, LAPS = 50, 4
 
 

@@ -18,9 +18,6 @@ from tests.averaging.graphs import (
 )
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N, H = 10, 25
 log_evidence = eqx.filter_jit(likelihood.log_evidence)
 explained = eqx.filter_jit(likelihood.explained)

@@ -10,9 +10,6 @@ from jaxreg.averaging import many
 from tests.averaging.graphs import random_graph
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 SIZES = [(9, 20), (10, 30), (7, 15)]
 PLAIN = jr.MotionAveraging()
 

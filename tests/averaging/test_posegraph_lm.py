@@ -15,9 +15,6 @@ from tests.averaging.graphs import motions, random_graph
 from tests.helpers import data_dir
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N, H = 6, 12
 
 

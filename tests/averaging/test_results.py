@@ -13,9 +13,6 @@ from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import motions, random_graph, rotations
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N, H = 8, 20
 PLAIN = MotionAveraging()
 

@@ -16,9 +16,6 @@ from jaxreg.correlation import KernelCorrelation, kernel_correlation
 from jaxreg.registrar import Frames
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N, M = 150, 200
 WIDTH = 0.25
 LANES = 64

@@ -7,9 +7,6 @@ from helpers import blob, motion, move, pose_error
 import jaxreg as jr
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 def test_steps_by_hand_lead_where_the_method_does():
     truth = motion(1, 2, angle=0.3, shift=200.0)
     target = 50 * blob(64, 2) + np.float32(300)

@@ -17,9 +17,6 @@ from jaxreg.neighbours import BruteForce
 from jaxreg.robust import L2
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N, M = 500, 800
 
 

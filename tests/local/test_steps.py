@@ -33,9 +33,6 @@ from jaxreg.neighbours import BruteForce
 from jaxreg.robust import L2, Huber
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 RESIDUALS = [PointToPoint(), PointToPlane(), PlaneToPlane(), Symmetric()]
 ITERATIVE = [GaussNewton(), GradientDescent(), LevenbergMarquardt()]
 by_residual = pytest.mark.parametrize(

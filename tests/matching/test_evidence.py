@@ -14,9 +14,6 @@ from jaxreg.datasets import sculpture_scans
 from jaxreg.matching import NO_EVIDENCE, Evidence
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 def _told(source: np.ndarray, normals: np.ndarray = UP) -> Evidence:
     return witness(as_cloud(source, normals), as_cloud(floor(0), UP)).of_pose(EYE)
 

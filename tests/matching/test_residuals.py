@@ -19,9 +19,6 @@ from jaxreg.matching import (
 )
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 EPSILON = 1 / 128
 RESIDUALS = [PointToPoint(), PointToPlane(0.25), PlaneToPlane(EPSILON), Symmetric()]
 by_residual = pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from evidence_clouds import EYE, UP, as_cloud, floor, witness
 from helpers import blob, motion
 from hypothesis import given, settings
@@ -13,9 +12,6 @@ from hypothesis import strategies as st
 
 from jaxreg.matching import Grip, Problem, match
 from jaxreg.neighbours import BruteForce
-
-
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
 
 
 def _slips(points: np.ndarray, normals: np.ndarray) -> bool:

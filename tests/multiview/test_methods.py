@@ -14,8 +14,6 @@ from jaxreg.geometry.kabsch import kabsch
 from jaxreg.registrar import AbstractRegistrar, Modes, RegistrationSolution
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
 KEY = jax.random.key(0)
 TRUTH = np.stack([motion(i, 2, angle=2.0, shift=3.0) for i in range(3)])
 # Each scan is of the same points in its own frame, in a unit of its own.

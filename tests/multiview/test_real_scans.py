@@ -8,6 +8,9 @@ from helpers import data_dir, pose_error
 import jaxreg as jr
 
 
+pytestmark = pytest.mark.usefixtures("fully_compiled")
+
+
 @pytest.mark.data
 @pytest.mark.slow
 def test_bunny_scans_come_together():

@@ -15,9 +15,6 @@ from jaxreg.neighbours import (
 )
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 EXACT = [BruteForce, BoxTree]
 INDEXES = [*EXACT, VoxelTable, CellGrid]
 OPTIONS = {VoxelTable: {"resolution": 16}, CellGrid: {"radius": 0.5}}

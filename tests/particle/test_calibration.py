@@ -13,6 +13,9 @@ import jaxreg as jr
 from jaxreg.registrar import Modes
 
 
+pytestmark = pytest.mark.usefixtures("fully_compiled")
+
+
 N = 600
 ROUND = 8  # pairs in a call; more would compile another program
 _contains = jax.jit(jax.vmap(Modes.contains, (0, 0, 0, None)))

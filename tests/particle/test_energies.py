@@ -23,9 +23,6 @@ from jaxreg.particle.modes import distinct_modes, first_within
 from jaxreg.robust import L2, AbstractKernel
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N = 128
 RNG = np.random.default_rng(0)
 POINTS = blob(N, 3) - blob(N, 3).mean(0)

@@ -45,9 +45,6 @@ from jaxreg.registration import register
 from jaxreg.robust import L2
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 N, P = 96, 24
 KEY = jax.random.key(0)
 STARTS = np.stack([motion(i, 2, shift=0.3) for i in range(P)])

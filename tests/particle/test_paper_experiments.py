@@ -42,6 +42,9 @@ from jaxreg.particle import (
 )
 
 
+pytestmark = pytest.mark.usefixtures("fully_compiled")
+
+
 TRIALS = 12
 
 

@@ -21,8 +21,6 @@ from jaxreg.particle import (
 )
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
 N, P, D = 96, 24, 2
 KEY = jax.random.key(0)
 # Far from the origin and in a small unit; the last start is near the truth.

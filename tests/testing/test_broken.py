@@ -28,9 +28,6 @@ from jaxreg.testing import (
 )
 
 
-pytestmark = pytest.mark.usefixtures("quickly_compiled")
-
-
 class Kernel(jr.AbstractKernel):
     """Least squares, or what `twist` makes of it."""
 
