@@ -19,9 +19,11 @@ from jaxreg.batching.progress import tell
 from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
 
 
-# The least number of poses that graphs are padded to, and half that of edges.
+# The least number of poses that graphs are padded to, and half that of edges: a power
+# of two; smaller programs take as long to compile.
 _LEAST = 8
-# Graphs in one call of a compiled program, at most, unless more are side by side.
+# Graphs in one call of a compiled program, at most, unless more are side by side:
+# progress is told after each, and a call costs a small share of so many graphs.
 _PIECE = 64
 
 
