@@ -43,8 +43,10 @@ def normals_from_cells(
     keys: Int[Array, " n"],
     size: Scalar,
     finest: int | Int[Array, ""],
-) -> Float[Array, "p d"]:
+) -> tuple[Float[Array, "p d"], "Windows"]:
     """Unit normals of either sign at `places`; zero where undefined.
+
+    And the windows that they come from, which their derivatives are of.
 
     Args:
         places: where normals are wanted, relative to the corner of the cells.
@@ -55,22 +57,35 @@ def normals_from_cells(
         finest: windows are made of cells of 2^finest times that size first, then of
             twice as large ones.
 
-    Gradients: exact by places, points and size, in O(p + n) memory.
+    Gradients: those of the windows; the normals as they are returned are cut.
     """
     frozen = lax.stop_gradient((places, mask, points, keys, size, finest))
     normals, level = _search(*frozen)
-    return _with_slopes(_Windows(normals, level, places, points, keys, size))
+    return normals, Windows(level, places, points, keys, size)
 
 
-class _Windows(eqx.Module):
-    """What normals depend on: `normals` and `level` themselves are held."""
+class Windows(eqx.Module):
+    """What normals depend on. Outside of loops: JAX drops their rules in those.
 
-    normals: Float[Array, "p d"]
+    (In jax 0.10.2 the derivative of a reverse pass through `lax.map` knows no more of
+    the `custom_jvp` inside.)
+
+    Attributes:
+        level: of the cells that a place is answered by; -1 of none.
+        places, points, keys, size: as of `normals_from_cells`.
+
+    Gradients: of normals exact by places, points and size, in O(p + n) memory.
+    """
+
     level: Int[Array, " p"]
     places: Float[Array, "p d"]
     points: Float[Array, "n d"]
     keys: Int[Array, " n"]
     size: Scalar
+
+    def follow(self, normals: Float[Array, "p d"]) -> Float[Array, "p d"]:
+        """The same normals, with derivatives."""
+        return _with_slopes(lax.stop_gradient(normals), self)
 
     def again(self) -> Float[Array, "p d"]:
         """The normals by the levels that are known; zero of places without."""
@@ -90,15 +105,15 @@ class _Windows(eqx.Module):
 
 
 @eqx.filter_custom_jvp
-def _with_slopes(at: _Windows) -> Float[Array, "p d"]:
+def _with_slopes(normals: Float[Array, "p d"], at: Windows) -> Float[Array, "p d"]:
     """The normals; nothing is computed for their derivatives until those are asked."""
-    return at.normals
+    return normals
 
 
 @_with_slopes.def_jvp
-def _with_slopes_jvp(primals: tuple[_Windows], tangents: tuple) -> tuple[Array, Array]:
+def _with_slopes_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     normals = _with_slopes(*primals)
-    slope = eqx.filter_jvp(lambda at: at.again(), primals, tangents)[1]
+    slope = eqx.filter_jvp(lambda at: at.again(), primals[1:], tangents[1:])[1]
     return normals, jnp.zeros_like(normals) if slope is None else slope
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.arrays import spread_rows
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Mask, Points
+from jaxreg.cloud.normals import Windows
 from jaxreg.cloud.range_image import RangeImage
 from jaxreg.neighbours import BruteForce, Neighbours
 
@@ -27,6 +28,7 @@ class PointCloud(BriefModule):
             there are no more.
         judged: the same surface with as many points as poses are judged by; None if
             these are as many.
+        window: what the normals were taken from, until they are `followed`.
     """
 
     points: Float[Array, "n d"]
@@ -36,6 +38,15 @@ class PointCloud(BriefModule):
     spacing: Float[Array, " n"] | None = None
     fine: "PointCloud | None" = None
     judged: "PointCloud | None" = None
+    window: Windows | None = None
+
+    def followed(self) -> "PointCloud":
+        """With normals that have the derivatives of the points that they are of."""
+        fine = None if self.fine is None else self.fine.followed()
+        if self.window is None:
+            return replace(self, fine=fine)
+        normals = self.window.follow(self.normals)
+        return replace(self, normals=normals, fine=fine, window=None)
 
     def padded(self, num: int) -> "PointCloud":
         """With masked rows behind it, `num` in all."""

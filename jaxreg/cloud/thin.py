@@ -39,8 +39,9 @@ def thin(
         num_neighbours: static; normals are estimated from the points around that many
             nearest places, or by `estimate_normals`' cells, ten times faster.
 
-    Gradients: by the points, of the means and the normals; which cell a point is in,
-    and so which points are merged, is held. The spacing around each is cut.
+    Gradients: by the points, of the means and, after `followed`, the normals; which
+    cell a point is in, and so which points are merged, is held. The spacing around each
+    is cut.
     """
     n = points.shape[0]
     merge = n > capacity
@@ -56,11 +57,11 @@ def thin(
         count = jax.ops.segment_sum(count, cell, capacity)
         total = jax.ops.segment_sum(places, cell, capacity)
         places, valid = total / jnp.maximum(count, 1)[:, None], count > 0
-    spacing = None
+    spacing = window = None
     if num_neighbours is None:
         # Cells that merge many points are windows already.
         finest = jnp.where(num >= _MANY * capacity, 0, 1)
-        normals = normals_from_cells(places, valid, samples, keys, size, finest)
+        normals, window = normals_from_cells(places, valid, samples, keys, size, finest)
     else:
         offset = jnp.where(keys[:, None] != UNUSED, samples - places[cell], 0)
         spread = jax.ops.segment_sum(
@@ -70,7 +71,7 @@ def thin(
             places, valid, count, spread, num_neighbours
         )
     points = jnp.where(valid[:, None], places + low, 0)
-    return PointCloud(points, normals, valid, spacing=spacing)
+    return PointCloud(points, normals, valid, spacing=spacing, window=window)
 
 
 def estimate_normals(points: Points, mask: Mask) -> Points:
@@ -81,7 +82,8 @@ def estimate_normals(points: Points, mask: Mask) -> Points:
     """
     low, size, rows, keys = _cells(points, mask, None)
     samples = jnp.where(mask[rows, None], points[rows] - low, 0)
-    normals = normals_from_cells(samples, mask[rows], samples, keys, size, 1)
+    normals, window = normals_from_cells(samples, mask[rows], samples, keys, size, 1)
+    normals = window.follow(normals)
     return jnp.zeros_like(normals).at[rows].set(normals)
 
 

@@ -137,7 +137,7 @@ def prepare_scan(
     """One scan: cloud, table, exact index, centroid and spacing."""
     mean = centroid(points, mask)
     method = method.in_frames(Frames(mean, mean, radius))
-    cloud = method.prepare((points - mean) / radius, mask).with_spacing()
+    cloud = method.prepare((points - mean) / radius, mask).followed().with_spacing()
     table = index_of(method, cloud)
     spacing = median_spacing(cloud.points, cloud.mask)
     judged, within = cloud.as_judged, spacing

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.adjoint import refusing
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.local import Curvature, at_rest
+from jaxreg.local import Curvature, Rest, at_rest
 from jaxreg.matching import NO_EVIDENCE, Evidence, Problem
 from jaxreg.particle.last_digits import LastRest, last_digits
 from jaxreg.particle.modes import distinct_modes, first_within
@@ -224,11 +224,15 @@ def _followed(
     """The poses with the derivatives of the balance at their last steps."""
     width = 0.5 * pair.spacing
     problem = Problem.of(pair.source, pair.target, exact.target_index)
-    every = followed(polishing(kernel, T.dtype), problem, width, T, sound)
-    if pair.source.fine is None:
-        return every
-    first = at_rest(LastRest(pair, kernel, width, T[0]))[0]
-    return every.at[0].set(jnp.where(sound[0] & enough, first, every[0]))
+    optimiser = polishing(kernel, T.dtype)
+    # The first outside of a loop: JAX drops rules of derivatives in those.
+    first = at_rest(Rest(optimiser, problem, width, T[0]))[0]
+    if pair.source.fine is not None:
+        last = at_rest(LastRest(pair, kernel, width, T[0]))[0]
+        first = jnp.where(enough, last, first)
+    first = jnp.where(sound[0], first, T[0])
+    others = followed(optimiser, problem, width, T[1:], sound[1:])
+    return jnp.concatenate([first[None], others])
 
 
 def _convincing(evidence: Evidence) -> Bool[Array, " q"]:

@@ -42,10 +42,11 @@ def prepare_pair(method: AbstractRegistrar, pair: tuple[Array, ...]) -> Prepared
     sides = on_both(Side.of, *_levelled((source, masks[0]), (target, masks[1])))
     frames = Frames(sides[0].mean, sides[1].mean, sides[1].radius)
     method = method.in_frames(frames)
-    source_cloud, target_cloud = on_both(
+    clouds = on_both(
         lambda cloud: method.prepare(*cloud),
         *(((side.points - side.mean) / frames.radius, side.mask) for side in sides),
     )
+    source_cloud, target_cloud = (cloud.followed() for cloud in clouds)
     return PreparedPair(
         method,
         source_cloud.first(len(source)),
