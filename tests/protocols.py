@@ -39,15 +39,17 @@ _SEARCH: dict[str, Any] = {
     "batch_size": 16,
 }
 _EXACT, _CUT = {"gradients": "exact"}, {"gradients": "zero"}
-_SEARCHES = {"gradients": "zero", "draws": True}
-#: Methods of `register`.
+_SEARCHES = {"gradients": "exact", "draws": True}
+#: Methods of `register`; all but those that refuse may be differentiated by the clouds,
+#: and `by` names the numbers of theirs that have an influence.
 REGISTRARS = {
     "ICP": Row(
-        lambda d: jr.ICP(jr.PointToPoint(), tolerance=1e-13, width_end=3.0), _EXACT
+        lambda d: jr.ICP(jr.PointToPoint(), tolerance=1e-13, width_end=3.0),
+        {**_EXACT, "by": ["width_end"]},
     ),
     "KernelCorrelation": Row(
         lambda d: jr.KernelCorrelation(0.25, tolerance=1e-9),
-        {**_EXACT, "lengths": True},
+        {**_EXACT, "by": ["bandwidth"], "lengths": True},
     ),
     "ParticleFilter": Row(
         lambda d: jr.ParticleFilter(
@@ -59,7 +61,8 @@ REGISTRARS = {
         lambda d: jr.MultiStart(num_starts=16, num_steps=8, **_SEARCH), _SEARCHES
     ),
     "sandhu2010": Row(
-        lambda d: jr.sandhu2010(d, 8, num_times=2, num_points=NUM_POINTS), _SEARCHES
+        lambda d: jr.sandhu2010(d, 8, num_times=2, num_points=NUM_POINTS),
+        {"gradients": "refused", "draws": True},
     ),
 }
 #: Methods of `average`.

@@ -3,7 +3,10 @@
 The loss is a weighted sum over the entries of the answer, with fixed random weights.
 Its derivative in one direction of the input is held against what it must be: ICP's
 answer follows a rigid motion of the source exactly, and correspondences do not change;
-averaging is held against a central difference.
+all others are held against central differences, which leave them as they are, too.
+
+Errors of a sensor move all points of both clouds: two noisy ones of 300 points, as a
+rigid motion alone would prove nothing about normals, widths and spacings.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,14 +24,17 @@ from bench.records import error
 from bench.workloads.local_data import draw, load
 from jaxreg.averaging import Correntropy, MotionAveraging, average
 from jaxreg.graph import PoseGraph
+from jaxreg.registrar import AbstractRegistrar
+from jaxreg.testing.problems import motion, move, surface
 from tests.averaging.graphs import random_graph
 
 
 def cases(options: Options) -> Iterator[Case]:
-    """ICP with respect to the source, averaging with respect to the motions."""
+    """Pairs by points and by errors of a sensor, averaging by the motions."""
     yield _icp()
     if options.quick:
         return
+    yield from _sensed_pairs()
     X, edges, T, _ = random_graph(32, 465, 0.0, 0)
     rng = np.random.default_rng(0)
     direction = rng.standard_normal(T.shape)
@@ -46,7 +52,65 @@ def cases(options: Options) -> Iterator[Case]:
             np.asarray(run(jnp.asarray(T + s * step * direction))) for s in (1, -1)
         )
         slope = (there - back) / (2 * step)
-        yield _case(f"{name}, 32 poses, by the motions", poses, T, direction, slope)
+        programs = _programs(poses, slope.shape)
+        yield _case(f"{name}, 32 poses, by the motions", programs, T, direction, slope)
+
+
+#: What moves points, in the order of `_sensed`, and methods that are asked about all.
+_CHANGES = (
+    "source points",
+    "target points",
+    "range bias",
+    "radial distortion",
+    "scale of an axis",
+    "scale of both",
+)
+_EYE = np.array([0.3, -3.0, 0.5])  # where the sensor stands
+_METHODS: dict[str, AbstractRegistrar] = {
+    "ICP": jr.ICP(tolerance=1e-13, max_steps=300),
+    "ParticleFilter": jr.ParticleFilter(),
+    "MultiStart": jr.MultiStart(),
+    "KernelCorrelation": jr.KernelCorrelation(tolerance=1e-12),
+}
+# Half of the difference: larger ones exchange matches on clouds as noisy as these.
+_STEP = 1e-7
+
+
+def _sensed(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Two noisy clouds of a surface, a seventh of a radian apart, changed by x."""
+    rng = np.random.default_rng(1)
+    source = surface(300, 3, 1)
+    noisy = source + 0.05 * rng.standard_normal(source.shape)
+    target = move(motion(3, 0.15, 0.05, 1), noisy)
+    moved = [
+        points + x[k] * rng.standard_normal(points.shape)
+        for k, points in enumerate((source, target))
+    ]
+
+    def seen(points: jax.Array) -> jax.Array:
+        ray = points - _EYE
+        length = jnp.linalg.norm(ray, axis=1, keepdims=True)
+        points = _EYE + ray * (1 + x[2] / length + x[3] * length)
+        return points * jnp.asarray([1, 1 + x[4], 1]) * (1 + x[5])
+
+    return seen(moved[0]), seen(moved[1])
+
+
+def _sensed_pairs() -> Iterator[Case]:
+    """A case for each change and method; a method's cases share their programs."""
+    for name, method in _METHODS.items():
+
+        def poses(x: jax.Array, method: AbstractRegistrar = method) -> jax.Array:
+            key = jax.random.key(0)
+            return jr.register(*_sensed(x), method, key=key).T_target_source
+
+        programs = _programs(poses, (4, 4))
+        for direction, what in zip(np.eye(len(_CHANGES)), _CHANGES, strict=True):
+            ends = (programs[0](jnp.asarray(s * _STEP * direction)) for s in (1, -1))
+            there, back = map(np.asarray, ends)
+            slope = (there - back) / (2 * _STEP)
+            x = np.zeros(len(_CHANGES))
+            yield _case(f"{name}, by {what}", programs, x, direction, slope)
 
 
 def _icp() -> Case:
@@ -63,19 +127,37 @@ def _icp() -> Case:
     direction = source @ twist[:3, :3].T + twist[:3, 3]
     answer = np.asarray(eqx.filter_jit(register)(jnp.asarray(source)))
     slope = -answer @ twist
-    return _case("ICP, 500 points, by the source", register, source, direction, slope)
+    programs = _programs(register, slope.shape)
+    return _case("ICP, 500 points, by the source", programs, source, direction, slope)
+
+
+#: The answer, and the gradient of the loss.
+_Programs = tuple[
+    Callable[[jax.Array], jax.Array],
+    Callable[[jax.Array], jax.Array],
+]
+
+
+def _weights(shape: tuple[int, ...]) -> np.ndarray:
+    return np.random.default_rng(1).standard_normal(shape)
+
+
+def _programs(
+    answer: Callable[[jax.Array], jax.Array], shape: tuple[int, ...]
+) -> _Programs:
+    weights = _weights(shape)
+    gradient = jax.grad(lambda x: jnp.sum(weights * answer(x)))
+    return eqx.filter_jit(answer), eqx.filter_jit(gradient)
 
 
 def _case(
     name: str,
-    answer: Callable[[jax.Array], jax.Array],
+    programs: _Programs,
     x: np.ndarray,
     direction: np.ndarray,
     slope: np.ndarray,
 ) -> Case:
-    weights = np.random.default_rng(1).standard_normal(slope.shape)
-    forward = eqx.filter_jit(answer)
-    gradient = eqx.filter_jit(jax.grad(lambda x: jnp.sum(weights * answer(x))))
+    weights, (forward, gradient) = _weights(slope.shape), programs
     return Case(
         name=name,
         data="generated",

@@ -92,12 +92,18 @@ class ICP(AbstractRegistrar):
     standard error of their sums; then the guess is returned (the scores are those of
     the end).
 
-    Gradients: with respect to both clouds and `width_end`, exact by the implicit
-    function theorem where the loop has converged, in forward and reverse mode.
-    Correspondences, the sample spacing, and a width that follows the residuals are
-    held; normals turn with their cloud as a whole; directions that are free do not
-    move, and nothing flows to `init`. With `RecursiveCheckpointAdjoint()` through the
-    steps, also to `init`, in reverse mode.
+    Gradients: by every point of both clouds, `width_end` and the numbers of residual
+    and kernel, exact by the implicit function theorem where the loop has converged: in
+    forward and reverse mode, and of second order (of many pairs through `jax.vmap`, as
+    JAX drops rules of derivatives within its loops). Normals, thinned points, sample
+    spacing, frames and kernel width follow the points. Held are the correspondences,
+    which points are merged and which cells normals are taken from: of two clouds of 300
+    points with a noise of a quarter of their spacing, differences of 1e-7 agree to
+    1e-6, but those of 1e-4 and more exchange matches, and differ several times over. A
+    width above `width_end` has the slope of the residual that it was taken from: exact
+    if the last step took it, but not if an earlier one did. Directions that are free do
+    not move, and nothing flows to `init` but where it is returned. With
+    `RecursiveCheckpointAdjoint()` through the steps, also to `init`, in reverse mode.
     """
 
     # Discs ten times thicker than GICP's reach the solution from farther away, with

@@ -100,7 +100,13 @@ class ParticleFilter(AbstractFilter):
     unless it can slip, or where the surfaces that agree can slip, as those of a
     cylinder; without refinement MAX_STEPS where the diffusion had not died.
 
-    Gradients: none; refine with `ICP` from the answer to differentiate it.
+    Gradients: of the poses by every point of both clouds, by the balance of pulls at
+    the last steps (implicit function theorem), in forward and reverse mode; held is
+    what `ICP` holds. The last steps are few: on noisy clouds of 300 points slopes agree
+    with differences of 1e-6 to 2 %, and to 1e-6 with ten times as many steps. Nothing
+    else has an influence on where pulls balance; of which poses are found, of scores
+    and covariances nothing is followed. Poses of all statuses have finite gradients.
+    Without refinement asking for them raises a TypeError.
     """
 
     num_prior: int = eqx.field(default=1536, static=True)

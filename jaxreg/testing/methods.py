@@ -35,12 +35,14 @@ Solve = Callable[..., tuple[jax.Array, Any]]
 class Answer:
     """Of one problem: a weighted sum of the pose, the solution, the slopes of the sum.
 
-    The slopes are by the first two arrays of the problem, or None.
+    The slopes are by the first two arrays of the problem and, where `solve` takes a
+    method, by its numbers; or None.
     """
 
     value: float
     solution: Any
     slopes: tuple[np.ndarray, np.ndarray] | None
+    by_numbers: Any = None
 
 
 def promise_method(
@@ -51,6 +53,7 @@ def promise_method(
     *,
     gradients: str | None,
     changes: Sequence[Change] = (),
+    with_numbers: bool = False,
 ) -> tuple[dict[str, Answer], Any]:
     """Requires of a method what does not depend on what it solves.
 
@@ -62,9 +65,12 @@ def promise_method(
         kind: class of its solutions.
         solve: the poses and the whole solution of a problem.
         problems: by name, arrays of the same shapes; among them "plain" and "other".
-        gradients: by the first two arrays: "zero" where they are cut, None where
-            nothing is promised, else those of central differences along `changes`.
+        gradients: by the first two arrays: "zero" where they are cut, "refused" where
+            asking for them raises a TypeError, None where nothing is promised, else
+            those of central differences along `changes`.
         changes: of "plain".
+        with_numbers: whether `solve` takes a method after the arrays, by the numbers of
+            which it is differentiated, too.
 
     Returns:
         The answers by the name of their problem, and the solution of "plain" alone.
@@ -73,7 +79,11 @@ def promise_method(
     name, plain = type(method).__name__, problems["plain"]
     with jax.enable_x64(True):
         together = {**problems, **_changed(plain, changes)}
-        answers = _side_by_side(solve, together, gradients is not None)
+        differentiate = gradients not in (None, "refused")
+        numbers = method if with_numbers else None
+        answers = _side_by_side(solve, together, differentiate, numbers)
+        if gradients == "refused":
+            _promise_refusal(name, solve, plain)
         for which in ("other", "plain"):
             alone = solve(*map(jax.device_put, problems[which]))[1]
             promise_dtypes(alone, float, name)
@@ -98,27 +108,44 @@ def promise_unit(name: str, scaled: np.ndarray, T: np.ndarray) -> None:
     promise_equal(back, T, what, atol=1e-6)
 
 
+def _weighed(out: jax.Array) -> jax.Array:
+    """A number that every entry of the poses has an influence on."""
+    weight = jnp.cos(jnp.arange(out.size, dtype=out.dtype)).reshape(out.shape)
+    return jnp.sum(weight * out)
+
+
 def _side_by_side(
-    solve: Solve, problems: Mapping[str, Problem], differentiate: bool
+    solve: Solve,
+    problems: Mapping[str, Problem],
+    differentiate: bool,
+    method: eqx.Module | None,
 ) -> dict[str, Answer]:
     """The answers to all problems by one program, `jit(vmap(solve))`."""
+    numbers, rest = eqx.partition(method, eqx.is_inexact_array)
 
-    def answer(*arrays: jax.Array) -> tuple[jax.Array, Any]:
-        out, solution = solve(*arrays)
-        weight = jnp.cos(jnp.arange(out.size, dtype=out.dtype)).reshape(out.shape)
-        return jnp.sum(weight * out), solution
+    def answer(changed: tuple, *arrays: jax.Array) -> tuple[jax.Array, Any]:
+        first, second, numbers = changed
+        given = () if method is None else (eqx.combine(numbers, rest),)
+        out, solution = solve(first, second, *arrays, *given)
+        return _weighed(out), solution
 
-    one = jax.value_and_grad(answer, (0, 1), has_aux=True) if differentiate else answer
+    one = jax.value_and_grad(answer, has_aux=True) if differentiate else answer
     columns = [
         jax.device_put(np.stack(x)) for x in zip(*problems.values(), strict=True)
     ]
-    out = jax.device_get(jax.jit(jax.vmap(one))(*columns))
+    run = jax.jit(jax.vmap(lambda a, b, *x: one((a, b, numbers), *x)))
+    out = jax.device_get(run(*columns))
     (value, solutions), slopes = out if differentiate else (out, None)
+
+    def of_lane(tree: Any, lane: int) -> Any:
+        return jax.tree.map(lambda x: x[lane], tree)
+
     return {
         name: Answer(
             float(value[lane]),
-            jax.tree.map(lambda x, lane=lane: x[lane], solutions),
-            None if slopes is None else tuple(x[lane] for x in slopes),
+            of_lane(solutions, lane),
+            None if slopes is None else of_lane(slopes[:2], lane),
+            None if slopes is None else of_lane(slopes[2], lane),
         )
         for lane, name in enumerate(problems)
     }
@@ -159,6 +186,19 @@ def _promise_slopes(
         rtol=1e-5,
         atol=1e-5 * largest,
     )
+
+
+def _promise_refusal(name: str, solve: Solve, problem: Problem) -> None:
+    """Requires a TypeError where a gradient is asked for."""
+
+    def value(first: jax.Array, *others: jax.Array) -> jax.Array:
+        return _weighed(solve(first, *others)[0])
+
+    try:
+        jax.eval_shape(jax.grad(value), *map(jax.device_put, problem))
+    except TypeError:
+        return
+    raise AssertionError(f"{name}: asked for a gradient it gives one, without a word.")
 
 
 def _promise_no_slopes(name: str, answers: Mapping[str, Answer]) -> None:

@@ -1,5 +1,6 @@
 """The promises of a method of `register`."""
 
+from collections.abc import Collection
 from typing import Literal
 
 import jax
@@ -32,7 +33,8 @@ def check_registrar(
     method: AbstractRegistrar,
     *,
     d: int = 3,
-    gradients: Literal["exact", "zero"] | None = None,
+    gradients: Literal["exact", "refused"] | None = None,
+    by: Collection[str] = (),
     draws: bool = False,
     lengths: bool = False,
 ) -> RegistrationSolution:
@@ -42,14 +44,18 @@ def check_registrar(
     of the data; poses that are rigid; masked rows and rows that are not finite count
     for nothing; TOO_FEW_POINTS and the identity for fewer than d + 1 points; that the
     pose follows both clouds when they are moved, and another unit of length; gradients
-    as said.
+    as said, finite also of clouds that leave directions free, share nothing or lie in
+    one place.
 
     Args:
         method: with a small budget, as compiling is what this costs; for exact
             gradients converged to about 1e-13.
         d: dimension of the points, 2 or 3.
         gradients: "exact" where those of the pose by both clouds are those of central
-            differences, "zero" where they are cut; None promises nothing.
+            differences, "refused" where asking for them raises a TypeError; None
+            promises nothing.
+        by: the numbers of the method that the pose depends on, by their paths, as
+            "width_end" or "kernel.share": it has a slope by these and no others.
         draws: whether it draws poses, which do not turn with the clouds; then these
             are only shifted.
         lengths: whether settings are lengths in the unit of the input; then the unit
@@ -63,12 +69,18 @@ def check_registrar(
     """
     key = jax.random.key(0)
 
-    def solve(*arrays: jax.Array) -> tuple[jax.Array, RegistrationSolution]:
-        source, target, init, *masks = arrays
+    def solve(
+        source: jax.Array,
+        target: jax.Array,
+        init: jax.Array,
+        source_mask: jax.Array,
+        target_mask: jax.Array,
+        method: AbstractRegistrar = method,
+    ) -> tuple[jax.Array, RegistrationSolution]:
         solution = register(
             *(source, target, method, init, key),
-            source_mask=masks[0],
-            target_mask=masks[1],
+            source_mask=source_mask,
+            target_mask=target_mask,
         )
         return solution.T_target_source, solution
 
@@ -77,7 +89,11 @@ def check_registrar(
         *(method, RegistrationSolution, solve, _problems(d, draws)),
         gradients=gradients,
         changes=_changes(d) if gradients == "exact" else (),
+        with_numbers=True,
     )
+    if gradients == "exact":
+        _promise_finite_slopes(name, answers)
+        _promise_influence(name, answers, frozenset(by))
     _promise_statuses(name, answers, d)
     _promise_equivariance(name, answers, d, draws, lengths)
     return alone
@@ -118,9 +134,24 @@ def _problems(d: int, draws: bool) -> dict[str, Problem]:
         "junk": (behind(7.0), target, still, *masks),
         "not finite": (behind(np.nan), target, still, everyone, target_mask),
         "few": (source, target, still, few, target_mask),
+        "flat": (_flat(source), _flat(target), still, *masks),
+        "round": (_round(source), _round(target), still, *masks),
+        "one place": (0 * source + 1, target, still, *masks),
+        "apart": (source, target**3 + 9 * source, still, *masks),
         "moved": (*moved, guess, *masks),
         "unit": (UNIT * source, UNIT * target, still, *masks),
     }
+
+
+def _flat(points: np.ndarray) -> np.ndarray:
+    """In a plane; on a line in 2D."""
+    return points * (np.arange(points.shape[1]) > 0)
+
+
+def _round(points: np.ndarray) -> np.ndarray:
+    """On a sphere, a circle in 2D; what lies at the origin stays."""
+    length = np.linalg.norm(points, axis=1, keepdims=True)
+    return points / np.where(length > 0, length, 1)
 
 
 def _changes(d: int) -> list[Change]:
@@ -131,6 +162,24 @@ def _changes(d: int) -> list[Change]:
     apart = rng.standard_normal(source.shape)
     rows = mask[:, None]
     return [(rows * apart, 0 * target), (0 * source, rows * carried)]
+
+
+def _promise_finite_slopes(name: str, answers: dict[str, Answer]) -> None:
+    for which, answer in answers.items():
+        slopes = jax.tree.leaves((answer.slopes, answer.by_numbers))
+        finite = all(np.isfinite(x).all() for x in slopes)
+        promise(finite, f"{name}: slopes of the problem '{which}' are not finite.")
+
+
+def _promise_influence(
+    name: str, answers: dict[str, Answer], by: frozenset[str]
+) -> None:
+    found = jax.tree_util.tree_leaves_with_path(answers["plain"].by_numbers)
+    moving = {jax.tree_util.keystr(path)[1:] for path, x in found if np.any(x)}
+    promise(
+        moving == by,
+        f"{name}: its pose has slopes by {sorted(moving)}, promised {sorted(by)}.",
+    )
 
 
 def _promise_statuses(name: str, answers: dict[str, Answer], d: int) -> None:
