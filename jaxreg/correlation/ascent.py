@@ -118,7 +118,7 @@ class Maximum(AbstractRest):
     target: PointCloud
     bandwidth: Scalar
     T: Motion
-    scale: None = None
+    scale: Scalar | None = None
 
     def ready(self) -> "Maximum":
         """As it is."""

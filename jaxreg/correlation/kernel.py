@@ -114,7 +114,7 @@ class KernelCorrelation(AbstractRegistrar):
         end = ended.state
 
         held = Quadratic.at(end.T, *fixed[:2], fixed[3])
-        T = at_rest(Maximum(source, target, width, end.T))[0]
+        T = at_rest(Maximum(source=source, target=target, bandwidth=width, T=end.T))[0]
 
         evidence = Witness.of_some(*fixed[:2]).of_pose(lax.stop_gradient(T))
         status = jnp.where(is_free(held), Status.DEGENERATE, ended.status)

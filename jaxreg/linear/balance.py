@@ -35,10 +35,17 @@ class AbstractBalance(eqx.Module):
     def pulls(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
         """Their sum b at a tangent from the answer."""
 
+    @abc.abstractmethod
     def solve(self, x: Float[Array, " k"], b: Float[Array, " k"]) -> Float[Array, " k"]:
-        """The least y with db/dx y = b; directions that are free get nothing."""
-        A = jax.jacfwd(self.pulls)(x)
-        return least_norm_solution(A, b, _FREE * float(jnp.finfo(A.dtype).eps))
+        """The least y with db/dx y = b, `by_slopes` unless more is known of it."""
+
+
+def by_slopes(
+    at: AbstractBalance, x: Float[Array, " k"], b: Float[Array, " k"]
+) -> Float[Array, " k"]:
+    """The least y with db/dx y = b; directions that are free get nothing."""
+    A = jax.jacfwd(at.pulls)(x)
+    return least_norm_solution(A, b, _FREE * float(jnp.finfo(A.dtype).eps))
 
 
 @eqx.filter_custom_jvp

@@ -283,17 +283,18 @@ def _settled(
     wide = optimiser.kernel.width_of(found.sq_residual, found.mask)
     follows = (end.width > limits.floor) & (wide > 0)
     share = jnp.where(follows, end.width / jnp.where(follows, wide, 1), 0)
-    T, scale = at_rest(
-        Rest(
-            optimiser,
-            problem,
-            jnp.where(follows, end.width, limits.floor),
-            end.T,
-            end.row,
-            end.scale if limits.with_scale else None,
-            *lax.stop_gradient((limits.farthest, share)),
-        )
+    farthest, share = lax.stop_gradient((limits.farthest, share))
+    rest = Rest(
+        optimiser=optimiser,
+        problem=problem,
+        width=jnp.where(follows, end.width, limits.floor),
+        T=end.T,
+        row=end.row,
+        scale=end.scale if limits.with_scale else None,
+        farthest=farthest,
+        follows=share,
     )
+    T, scale = at_rest(rest)
     return T, end.scale if scale is None else scale
 
 

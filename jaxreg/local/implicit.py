@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
-from jaxreg.linear.balance import AbstractBalance, balanced
+from jaxreg.linear.balance import AbstractBalance, balanced, by_slopes
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.steps import turn_and_shift
 from jaxreg.matching.problem import Match, Problem, match
@@ -80,6 +80,10 @@ class Rest(AbstractRest):
         zero, one = jnp.zeros_like(self.width), jnp.ones_like(self.width)
         slope = jax.jvp(energy, (zero,), (one,))[1]
         return jnp.concatenate([b, -slope[None]])
+
+    def solve(self, x: Float[Array, " k"], b: Float[Array, " k"]) -> Float[Array, " k"]:
+        """By the slopes of the pulls."""
+        return by_slopes(self, x, b)
 
     def _weighed(self, x: Float[Array, " k"]) -> tuple[Match, Float[Array, " n"]]:
         """The same matches at a tangent from the pose, and their weights there."""

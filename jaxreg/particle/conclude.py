@@ -226,9 +226,9 @@ def _followed(
     problem = Problem.of(pair.source, pair.target, exact.target_index)
     optimiser = polishing(kernel, T.dtype)
     # The first outside of a loop: JAX drops rules of derivatives in those.
-    first = at_rest(Rest(optimiser, problem, width, T[0]))[0]
+    first = at_rest(Rest(optimiser=optimiser, problem=problem, width=width, T=T[0]))[0]
     if pair.source.fine is not None:
-        last = at_rest(LastRest(pair, kernel, width, T[0]))[0]
+        last = at_rest(LastRest(pair=pair, kernel=kernel, width=width, T=T[0]))[0]
         first = jnp.where(enough, last, first)
     first = jnp.where(sound[0], first, T[0])
     others = followed(optimiser, problem, width, T[1:], sound[1:])

@@ -54,15 +54,21 @@ class LastRest(AbstractRest):
     kernel: AbstractKernel
     width: Scalar
     T: Motion
-    scale: None = None
+    scale: Scalar | None = None
 
     def ready(self) -> Rest:
         """With the finest clouds and their indexes."""
-        return Rest(*_last(self.pair, self.kernel, self.width), self.T).ready()
+        optimiser, problem, width = _last(self.pair, self.kernel, self.width)
+        rest = Rest(optimiser=optimiser, problem=problem, width=width, T=self.T)
+        return rest.ready()
 
     def pulls(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
         """Those of `ready`."""
         return self.ready().pulls(x)
+
+    def solve(self, x: Float[Array, " k"], b: Float[Array, " k"]) -> Float[Array, " k"]:
+        """That of `ready`."""
+        return self.ready().solve(x, b)
 
 
 def _last(

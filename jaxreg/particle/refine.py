@@ -88,7 +88,9 @@ def followed(
     def one(mode: tuple[Motion, Bool[Array, ""]]) -> Motion:
         return lax.cond(
             mode[1],
-            lambda T: at_rest(Rest(optimiser, problem, width, T))[0],
+            lambda T: at_rest(
+                Rest(optimiser=optimiser, problem=problem, width=width, T=T)
+            )[0],
             lambda T: T,
             mode[0],
         )
