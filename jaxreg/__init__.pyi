@@ -61,4 +61,5 @@ from .registrar import SearchTrace as SearchTrace
 from .registration import register as register
 from .robust import AbstractKernel as AbstractKernel
 
+__all__: list[str]
 __version__: str

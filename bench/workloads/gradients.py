@@ -93,7 +93,7 @@ def _sensed(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         points = _EYE + ray * (1 + x[2] / length + x[3] * length)
         return points * jnp.asarray([1, 1 + x[4], 1]) * (1 + x[5])
 
-    return seen(moved[0]), seen(moved[1])
+    return seen(jnp.asarray(moved[0])), seen(jnp.asarray(moved[1]))
 
 
 def _sensed_pairs() -> Iterator[Case]:
