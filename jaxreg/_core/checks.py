@@ -154,7 +154,7 @@ def check_rigid(T: Array | np.ndarray, name: str, scaled: bool = False) -> None:
 
 
 def check_key(key: Key | None, name: str = "key") -> Key:
-    """Requires a PRNG key of `jax.random.key` (or the older `PRNGKey`)."""
+    """Requires one PRNG key of `jax.random.key` (or the older `PRNGKey`)."""
     if key is None:
         raise ValueError(
             f"{name}: this method draws random numbers; pass key=jax.random.key(seed)."
@@ -163,7 +163,9 @@ def check_key(key: Key | None, name: str = "key") -> Key:
         raise TypeError(
             f"{name}: wanted jax.random.key(seed), found {type(key).__name__}."
         )
-    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and not key.ndim:
+    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        if key.ndim:
+            raise ValueError(f"{name}: wanted one key, found shape {key.shape}.")
         return key
     if key.dtype == jnp.uint32 and key.shape == (2,):
         return jax.random.wrap_key_data(key)

@@ -166,8 +166,6 @@ class AbstractSearch(AbstractIndexedRegistrar):
     ) -> RegistrationSolution:
         """Searches, refines and scores in the prepared frames."""
         key = check_key(key)
-        if key.ndim:
-            raise ValueError(f"key: wanted one key, found shape {key.shape}.")
         indexes = self._indexes(source, target)
         return self.solve_indexed(source, target, *indexes, init, key)
 
