@@ -28,7 +28,7 @@ CALLS: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (jr.register, {"source": iter(CLOUD)}, "source: .*numbers"),
     (jr.register, {"source": CLOUD.astype(np.longdouble)}, "source: wanted float32"),
     (jr.register, {"source_mask": [[True], []]}, "source_mask: not a rectangular"),
-    (jr.register, {"key": TWO_KEYS}, "key: wanted jax.random.key"),
+    (jr.register, {"key": TWO_KEYS}, "key: wanted one key"),
     (jr.register, {"batch_size": 2**40}, "batch_size: wanted an integer below 2"),
     (jr.average, {"graph": TWO_GRAPHS}, r"graph: wanted one graph, found .*\(2,\)"),
     (jr.average, {"init": 2 * POSES}, "init: wanted rigid motions"),
