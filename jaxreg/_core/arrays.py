@@ -22,7 +22,7 @@ def traced(default: float | None) -> Any:
     return eqx.field(default=default, converter=_as_scalar, metadata={TRACED: True})
 
 
-def _as_scalar(x: float | Array) -> Array:
+def _as_scalar(x: float | Array | None) -> Array | None:
     if not _is_number(x):
         return x  # pyright: ignore[reportReturnType]
     try:

@@ -108,6 +108,15 @@ class Ascending(AbstractIteration[Motion, Ascent]):
         return Quadratic.at(T, self.source, self.target, self.bandwidth)
 
 
+def newton_step(model: Quadratic, b: Float[Array, " k"]) -> Float[Array, " k"]:
+    """The undamped step H^-1 b, H of the model; free directions are left alone."""
+    curvature, vector, unit = _principal(model)
+    held = curvature > _FREE
+    along = jnp.sum(vector * (unit * b)[:, None], axis=0)
+    along = jnp.where(held, along / jnp.where(held, curvature, 1), 0)
+    return unit * jnp.sum(vector * along, axis=1)
+
+
 class Maximum(AbstractRest):
     """Where an ascent ended, for `at_rest`: the pulls of all pairs balance.
 
@@ -133,11 +142,7 @@ class Maximum(AbstractRest):
 
         Directions in which the correlation is free, or rises, get nothing.
         """
-        curvature, vector, unit = _principal(self._model(x))
-        held = curvature > _FREE
-        along = jnp.sum(vector * (unit * b)[:, None], axis=0)
-        along = jnp.where(held, along / jnp.where(held, curvature, 1), 0)
-        return -unit * jnp.sum(vector * along, axis=1)
+        return -newton_step(self._model(x), b)
 
     def _model(self, x: Float[Array, " k"]) -> Quadratic:
         T = turn_and_shift(self.T, x)

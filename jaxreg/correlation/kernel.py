@@ -11,10 +11,10 @@ from jaxreg._core.loop import iterate
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points
 from jaxreg.cloud import PointCloud, median_spacing, thin, without_noise
-from jaxreg.correlation.ascent import Ascending, Maximum, is_free
+from jaxreg.correlation.ascent import Ascending, Maximum, is_free, newton_step
 from jaxreg.correlation.quadratic import Quadratic, pull_on_target
 from jaxreg.geometry import lie
-from jaxreg.local import at_rest, sandwich
+from jaxreg.local import at_rest, sandwich, turn_and_shift
 from jaxreg.matching import Witness
 from jaxreg.registrar import AbstractRegistrar, Frames, Modes, RegistrationSolution
 
@@ -114,7 +114,9 @@ class KernelCorrelation(AbstractRegistrar):
         end = ended.state
 
         held = Quadratic.at(end.T, *fixed[:2], fixed[3])
-        T = at_rest(Maximum(source=source, target=target, bandwidth=width, T=end.T))[0]
+        T = turn_and_shift(end.T, newton_step(held, held.b))
+        T = jnp.where(ended.converged, T, end.T)
+        T = at_rest(Maximum(source=source, target=target, bandwidth=width, T=T))[0]
 
         evidence = Witness.of_some(*fixed[:2]).of_pose(lax.stop_gradient(T))
         status = jnp.where(is_free(held), Status.DEGENERATE, ended.status)
