@@ -50,7 +50,7 @@ class MultiStart(AbstractSearch):
     Gradients: of the poses by every point of both clouds, by the balance of pulls at
     the last steps (implicit function theorem), in forward and reverse mode; held is
     what `ICP` holds. The last steps are few: on noisy clouds of 300 points slopes agree
-    with differences of 1e-6 to 2 %, and to 1e-6 with ten times as many steps. Nothing
+    with differences of 1e-7 to 5 %, and to 1e-6 with ten times as many steps. Nothing
     else has an influence on where pulls balance; of which poses are found, of scores
     and covariances nothing is followed. Poses of all statuses have finite gradients.
     Without refinement asking for them raises a TypeError.
