@@ -1,7 +1,8 @@
 """Every public method and part keeps its contract, inside `jit`, `vmap` and `grad`."""
 
 import inspect
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +50,24 @@ from jaxreg.testing.promises import (
 )
 
 
+#: Whose whole check is left to `-m slow`: each shares its parts with one that is not.
+SLOW = {
+    *("MultiStart", "sandhu2010"),
+    *("CycleConsensus", "MCC", "WeightedMotionAveraging", "LowRankSparse"),
+    *("BoxTree", "CellGrid"),
+}
+
+
+def _marked(names: Iterable[Any]) -> list[Any]:
+    """Names of a table for `parametrize`, with the mark of those that take long."""
+    marks = {True: pytest.mark.slow, False: ()}
+    return [pytest.param(x, marks=marks[_name(x) in SLOW], id=_name(x)) for x in names]
+
+
+def _name(x: Any) -> str:
+    return x if isinstance(x, str) else x.__name__
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _strict() -> Iterator[None]:
     """What is not a number raises. Compiled in a hurry: these programs run once."""
@@ -90,7 +109,7 @@ def test_every_public_method_is_in_the_table():
     assert functions == FUNCTIONS
 
 
-@pytest.mark.parametrize("name", REGISTRARS)
+@pytest.mark.parametrize("name", _marked(REGISTRARS))
 def test_methods_of_register(name, monkeypatch):
     row = REGISTRARS[name]
     # Gradients are those of pulls that balance, which takes more last steps than most
@@ -102,13 +121,13 @@ def test_methods_of_register(name, monkeypatch):
     check_registrar(row.make(d), d=d, **row.promises)
 
 
-@pytest.mark.parametrize("name", AVERAGERS)
+@pytest.mark.parametrize("name", _marked(AVERAGERS))
 def test_methods_of_average(name):
     row = AVERAGERS[name]
     check_averager(row.make(3), **row.promises)
 
 
-@pytest.mark.parametrize("index", INDEXES)
+@pytest.mark.parametrize("index", _marked(INDEXES))
 def test_indexes(index):
     row = INDEXES[index]
     with jax.debug_nans(False):  # queries that are not finite are asked on purpose

@@ -12,7 +12,6 @@ pytestmark = pytest.mark.usefixtures("fully_compiled")
 
 
 @pytest.mark.data
-@pytest.mark.slow
 def test_bunny_scans_come_together():
     with np.load(data_dir("stanford_bunny", "bunny_scans.npz")) as file:
         poses = jr.io.read_conf(data_dir("stanford_bunny", "bun.conf"))
