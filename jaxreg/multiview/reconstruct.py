@@ -7,6 +7,8 @@ all pairs; called with arrays, a thin loop chooses the pairs round by round, run
 batches of them at a time, and reports progress.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -125,23 +127,18 @@ def reconstruct(
         )
     if positions is not None:
         positions.check_fits(points, method)
-        positions = cast_floats(positions, points.dtype)
-    key = check_key(key)
-    order = _checked(order)
+    inputs = points, row_mask, eyes, cast_floats(positions, points.dtype)
+    key, order = check_key(key), _checked(order)
     if not (is_concrete(points) and is_concrete(key)):
         if order != "any" or not (previous is None and on_pairs is None):
             raise ValueError(
                 "order, previous, on_pairs: pairs are chosen outside of jit only."
             )
-        prepared = prepare_scans(method, points, row_mask, eyes, positions)
-        pairs = jnp.asarray(all_pairs(points.shape[0]))
-        motions = relative_motions(method, prepared, pairs, key)
-        return finish(method, averaging, prepared, motions)
+        return _of_all_pairs(method, averaging, inputs, key)
 
     report = progress if progress is not None else _silent
     report("preparing scans", 0, 1)
-    prepared = prepare_scans(method, points, row_mask, eyes, positions)
-    prepared = jax.block_until_ready(prepared)
+    prepared = jax.block_until_ready(prepare_scans(method, *inputs))
     report("preparing scans", 1, 1)
     known, first = _known(previous, prepared, order)
     rounds = Rounds(method, averaging, prepared, key, known, on_pairs, report)
@@ -155,6 +152,19 @@ def reconstruct(
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
     return far.back(solution.of_pairs(len(motions.overlap)))
+
+
+def _of_all_pairs(
+    method: AbstractRegistrar,
+    averaging: AbstractAverager | None,
+    inputs: tuple[Any, ...],
+    key: Key,
+) -> ReconstructionSolution:
+    """What can be traced: no pair is chosen by what others told."""
+    prepared = prepare_scans(method, *inputs)
+    pairs = jnp.asarray(all_pairs(prepared.num_scans))
+    motions = relative_motions(method, prepared, pairs, key)
+    return finish(method, averaging, prepared, motions)
 
 
 def _known(

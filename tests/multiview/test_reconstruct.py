@@ -16,6 +16,9 @@ from jaxreg.multiview import RelativeMotions
 from jaxreg.multiview.check_scans import padded_scans
 
 
+pytestmark = pytest.mark.usefixtures("fully_compiled")
+
+
 FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64)
 
 MOTIONS = RelativeMotions(

@@ -38,6 +38,8 @@ _STALE, _MOVED = 2, 0.3
 # Damping after the first refused step, and the least. There is none before: even 1e-9
 # of the diagonal holds back the bending of a long chain, so that steps converge slowly.
 _DAMPED = 1e-6
+# A sum of the costs of edges is known to so many units of rounding.
+_ROUNDING = 8
 
 
 class Problem(NamedTuple):
@@ -189,7 +191,7 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         return jnp.isnan(state.next_gain)
 
     def step(self, state: _State) -> _State:
-        """One damped step, kept if it lowers the cost."""
+        """One damped step, kept if it lowers the cost, as far as that is known."""
         s, problem = state, self.problem
         Q, force = problem.normal(s.T)
         graph = problem.graph
@@ -199,7 +201,9 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         x, rounds = _tangents(matrix, force, inverse)
         T = nearby_rotation(product(lie.exp(x), s.T))
         cost = problem.cost(T)
-        better = cost <= s.cost
+        # Poses are known better than their cost: a step that is lost in its rounding
+        # may still be right.
+        better = cost <= s.cost * (1 + _ROUNDING * jnp.finfo(cost.dtype).eps)
         gain = jnp.where(
             s.cost > 0, (s.cost - cost) / jnp.where(s.cost > 0, s.cost, 1), 0
         )
