@@ -22,7 +22,7 @@ from jaxreg.app.versions import versions
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.graphs.g2o import write_g2o
-from jaxreg.io.points.ply import write_ply
+from jaxreg.io.points.write_ply import write_ply
 from jaxreg.io.poses.tum import write_tum
 
 
