@@ -97,3 +97,11 @@ def test_a_guess_that_is_not_rigid_is_refused(scale):
         jr.register(source, target, jr.ICP(with_scale=True), init=bent)
     with pytest.raises(ValueError, match="init: wanted rigid motions"):
         jr.register([source], [target], jr.ICP(), init=bent[None])
+
+
+def test_a_guess_beyond_all_numbers_on_the_map_has_a_status():
+    source, target, T_true = _far(0)
+    lost = T_true.copy()
+    lost[0, 3] = 1e300
+    sol = jr.register(source, target, jr.ICP(), init=lost)
+    assert int(sol.status) == Status.NON_FINITE

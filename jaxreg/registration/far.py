@@ -162,11 +162,13 @@ def _with_translation(T: np.ndarray, t: np.ndarray) -> np.ndarray:
 def _orthonormal(T: np.ndarray) -> np.ndarray:
     """To the last digit: seven of a rotation are a metre at a million metres.
 
-    A scale that was looked for stays.
+    A scale that was looked for stays, and so does what is not finite.
     """
-    U, size, Vt = np.linalg.svd(T[..., :-1, :-1])
+    T = np.where(np.isfinite(T).all(axis=(-2, -1), keepdims=True), T, np.nan)
+    known = ~np.isnan(T)
+    U, size, Vt = np.linalg.svd(np.where(known, T, np.eye(T.shape[-1]))[..., :-1, :-1])
     scale = np.mean(size, axis=-1)
     scale = np.where(np.abs(scale - 1) < _ROUNDING, 1, scale)
     out = T.copy()
     out[..., :-1, :-1] = scale[..., None, None] * (U @ Vt)
-    return out
+    return np.where(known, out, np.nan)

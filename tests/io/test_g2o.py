@@ -1,5 +1,6 @@
 import gzip
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -232,3 +233,11 @@ def test_public_files(name, poses, edges, has_vertices):
     graph = read_g2o(path)
     assert (graph.num_poses, graph.num_edges) == (poses, edges)
     assert (read_g2o_poses(path)[1] is not None) == has_vertices
+
+
+def test_what_would_not_be_read_is_not_written(tmp_path):
+    graph, _ = random_graph(3)
+    negative = eqx.tree_at(lambda g: g.weight, graph, -graph.weight)
+    with pytest.raises(ValueError, match=r"edge 0 .*weight is negative"):
+        write_g2o(tmp_path / "a.g2o", negative)
+    assert not list(tmp_path.iterdir())

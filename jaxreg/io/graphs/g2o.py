@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxreg._core.checks import as_host_array, as_host_numbers, check_rigid
 from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
-from jaxreg.graph.edge_checks import EdgeError
+from jaxreg.graph.edge_checks import EdgeError, check_information, check_weights
 from jaxreg.graph.pose_graph import PoseGraph, check_graph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
@@ -130,10 +130,13 @@ def write_g2o(
         ids: `(v,)` names of the frames, None for 0, 1, 2, ...
 
     Raises:
-        ValueError: if `T_world_i` or `ids` do not belong to the graph.
+        ValueError: if `T_world_i` or `ids` do not belong to the graph, or it holds what
+            `read_g2o` refuses: negative weights, indefinite information.
         InputError: if the folder cannot be written.
     """
     check_graph(graph, "graph")
+    check_weights(graph.weight, graph.edges, graph.mask)
+    check_information(graph.information, graph.edges, graph.mask)
     d, num = graph.dim, graph.num_poses
     names = as_host_array(np.arange(num) if ids is None else ids, "ids")
     if names.shape != (num,):
