@@ -38,7 +38,7 @@ _SEARCH: dict[str, Any] = {
     "max_points": NUM_POINTS,
     "batch_size": 16,
 }
-_EXACT, _CUT = {"gradients": "exact"}, {"gradients": "zero"}
+_EXACT, _REFUSED = {"gradients": "exact"}, {"gradients": "refused"}
 _SEARCHES = {"gradients": "exact", "draws": True}
 #: Methods of `register`; all but those that refuse may be differentiated by the clouds,
 #: and `by` names the numbers of theirs that have an influence.
@@ -67,10 +67,10 @@ REGISTRARS = {
 }
 #: Methods of `average`.
 AVERAGERS = {
-    "SpanningTree": Row(lambda d: jr.SpanningTree(), _CUT),
-    "ShortestPaths": Row(lambda d: jr.ShortestPaths(), _CUT),
-    "CycleConsensus": Row(lambda d: CycleConsensus(), _CUT),
-    "LowRankSparse": Row(lambda d: jr.LowRankSparse(), _CUT),
+    "SpanningTree": Row(lambda d: jr.SpanningTree(), _REFUSED),
+    "ShortestPaths": Row(lambda d: jr.ShortestPaths(), _REFUSED),
+    "CycleConsensus": Row(lambda d: CycleConsensus(), _REFUSED),
+    "LowRankSparse": Row(lambda d: jr.LowRankSparse(), _REFUSED),
     "MotionAveraging": Row(lambda d: jr.MotionAveraging(tolerance=1e-13), _EXACT),
     "WeightedMotionAveraging": Row(
         lambda d: jr.WeightedMotionAveraging(tolerance=1e-13), _EXACT

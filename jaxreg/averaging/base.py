@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.adjoint import refusing
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.loop import status_of
@@ -141,11 +142,28 @@ def solution(
     )
 
 
+def of_start(
+    method: AbstractAverager, graph: PoseGraph, found: AveragingSolution
+) -> AveragingSolution:
+    """A solution at which nothing balances: asking for its derivatives is an error."""
+    name = type(method).__name__
+    told = (
+        f"{name} finds a start, which no equation holds: it has no derivative. Average "
+        f"from it, as by Correntropy(initialiser={name}()), or hold the graph by "
+        "jax.lax.stop_gradient."
+    )
+    poses = refusing(found.T_world_i, (method, graph), told)
+    return dataclasses.replace(found, T_world_i=poses)
+
+
 def starting_poses(
     initialiser: AbstractAverager,
     graph: PoseGraph,
     init: Float[Array, "v D D"] | None,
     key: Key | None,
 ) -> Float[Array, "v D D"]:
-    """The poses to start from: `init`, or what the initialiser finds."""
-    return initialiser.solve(graph, None, key).T_world_i if init is None else init
+    """The poses to start from: `init`, or what the initialiser finds; held."""
+    if init is not None:
+        return init
+    held = jax.lax.stop_gradient(graph)
+    return initialiser.solve(held, None, key).T_world_i

@@ -39,7 +39,7 @@ def check_averager(
     method: AbstractAverager,
     *,
     d: int = 3,
-    gradients: Literal["exact", "at held widths", "zero"] | None = None,
+    gradients: Literal["exact", "at held widths", "refused"] | None = None,
     turns: bool = True,
     lengths: bool = False,
 ) -> AveragingSolution:
@@ -58,7 +58,8 @@ def check_averager(
         d: dimension of space, 2 or 3.
         gradients: "exact" where those of the poses by motions and weights are those of
             central differences, "at held widths" where they are for changes that leave
-            all residuals, "zero" where they are cut; None promises nothing.
+            all residuals, "refused" where asking for them raises a TypeError; None
+            promises nothing.
         turns: whether poses follow turns of the frames, though motions are noisy.
         lengths: whether a radian counts as one unit of length; then the unit stays.
 

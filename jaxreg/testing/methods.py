@@ -65,9 +65,9 @@ def promise_method(
         kind: class of its solutions.
         solve: the poses and the whole solution of a problem.
         problems: by name, arrays of the same shapes; among them "plain" and "other".
-        gradients: by the first two arrays: "zero" where they are cut, "refused" where
-            asking for them raises a TypeError, None where nothing is promised, else
-            those of central differences along `changes`.
+        gradients: by the first two arrays: "refused" where asking for them raises a
+            TypeError, None where nothing is promised, else those of central differences
+            along `changes`.
         changes: of "plain".
         with_numbers: whether `solve` takes a method after the arrays, by the numbers of
             which it is differentiated, too.
@@ -95,8 +95,6 @@ def promise_method(
         promise_dtypes(out, np.float32, name)
     if changes:
         _promise_slopes(name, answers, changes)
-    elif gradients == "zero":
-        _promise_no_slopes(name, answers)
     return answers, alone
 
 
@@ -199,11 +197,3 @@ def _promise_refusal(name: str, solve: Solve, problem: Problem) -> None:
     except TypeError:
         return
     raise AssertionError(f"{name}: asked for a gradient it gives one, without a word.")
-
-
-def _promise_no_slopes(name: str, answers: Mapping[str, Answer]) -> None:
-    """Requires a gradient of zero."""
-    slopes = answers["plain"].slopes
-    assert slopes is not None
-    zero = not any(np.any(x) for x in slopes)
-    promise(zero, f"{name}: its gradient is not zero, though it was said to be.")

@@ -18,7 +18,12 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_positive
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.typing import Key, Scalar
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
+from jaxreg.averaging.base import (
+    AbstractAverager,
+    AveragingSolution,
+    of_start,
+    solution,
+)
 from jaxreg.averaging.measures import length_scale
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
@@ -43,8 +48,9 @@ class LowRankSparse(AbstractAverager):
     Raises:
         ValueError: for more than `DENSE_LIMIT` frames.
 
-    Gradients: none (cut); it serves as a start. `edge_weight` is threshold / distance
-    of the block from L, at most 1.
+    `edge_weight` is threshold / distance of the block from L, at most 1.
+
+    Gradients: none; asking for them raises a TypeError.
     """
 
     threshold: Array | float = traced(0.05)
@@ -71,22 +77,23 @@ class LowRankSparse(AbstractAverager):
                 f"LowRankSparse: wanted at most {DENSE_LIMIT} poses, found {num}; "
                 "use SpanningTree or CycleConsensus."
             )
-        graph, self = jax.lax.stop_gradient((graph, self))
-        scale = length_scale(graph)
-        X, seen = _blocks(graph, scale)
-        limit = jnp.maximum(self.tolerance, 8 * jnp.finfo(X.dtype).eps)
-        splitting = _Splitting(X, seen, jnp.asarray(self.threshold), limit)
+        held, method = jax.lax.stop_gradient((graph, self))
+        scale = length_scale(held)
+        X, seen = _blocks(held, scale)
+        limit = jnp.maximum(method.tolerance, 8 * jnp.finfo(X.dtype).eps)
+        splitting = _Splitting(X, seen, jnp.asarray(method.threshold), limit)
         eye = jnp.tile(jnp.eye(D, dtype=X.dtype), (num, 1))
-        ended = iterate(splitting, splitting.init(eye), max_steps=self.max_steps)
+        ended = iterate(splitting, splitting.init(eye), max_steps=method.max_steps)
         end = ended.state
-        distance = _block_norms(X - end.L, num)[graph.edges[:, 0], graph.edges[:, 1]]
-        return solution(
-            graph,
+        distance = _block_norms(X - end.L, num)[held.edges[:, 0], held.edges[:, 1]]
+        found = solution(
+            held,
             _poses(end.L, num, scale),
-            edge_weight=self.threshold / jnp.maximum(distance, self.threshold),
+            edge_weight=method.threshold / jnp.maximum(distance, method.threshold),
             converged=ended.converged,
             num_steps=end.num_steps,
         )
+        return of_start(self, graph, found)
 
 
 class _State(NamedTuple):

@@ -4,7 +4,12 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
+from jaxreg.averaging.base import (
+    AbstractAverager,
+    AveragingSolution,
+    of_start,
+    solution,
+)
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -16,7 +21,7 @@ class ShortestPaths(AbstractAverager):
     breadth-first tree for equal weights. Other edges are not used, and none is judged:
     `edge_weight` is 1 for every edge. `init` is ignored.
 
-    Gradients: none (the topology and the start are cut).
+    Gradients: none; asking for them raises a TypeError.
     """
 
     @eqx.filter_jit
@@ -28,4 +33,5 @@ class ShortestPaths(AbstractAverager):
     ) -> AveragingSolution:
         """Chains the motions of a prepared graph."""
         args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
-        return solution(graph, trees.shortest_paths(*args).T_root_i)
+        found = solution(graph, trees.shortest_paths(*args).T_root_i)
+        return of_start(self, graph, found)

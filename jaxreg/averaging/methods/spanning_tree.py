@@ -4,7 +4,12 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
+from jaxreg.averaging.base import (
+    AbstractAverager,
+    AveragingSolution,
+    of_start,
+    solution,
+)
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
 
@@ -15,7 +20,7 @@ class SpanningTree(AbstractAverager):
     Other edges are not used, and none is judged: `edge_weight` is 1 for every edge.
     `init` is ignored.
 
-    Gradients: none (the topology and the start are cut).
+    Gradients: none; asking for them raises a TypeError.
     """
 
     @eqx.filter_jit
@@ -27,4 +32,5 @@ class SpanningTree(AbstractAverager):
     ) -> AveragingSolution:
         """Chains the motions of a prepared graph."""
         args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
-        return solution(graph, trees.maximum_spanning_tree(*args).T_world_i)
+        found = solution(graph, trees.maximum_spanning_tree(*args).T_world_i)
+        return of_start(self, graph, found)

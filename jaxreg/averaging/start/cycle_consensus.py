@@ -10,7 +10,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.checks import check_counts, is_concrete
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.typing import Key
-from jaxreg.averaging.base import AbstractAverager, AveragingSolution, solution
+from jaxreg.averaging.base import (
+    AbstractAverager,
+    AveragingSolution,
+    of_start,
+    solution,
+)
 from jaxreg.averaging.likelihood import SETTLED, agreed_share, explained
 from jaxreg.averaging.start.cycles import edge_log_odds, judged
 from jaxreg.averaging.start.settle import settled
@@ -45,7 +50,7 @@ class CycleConsensus(AbstractAverager):
             (static).
         max_cycles: graphs of more edges times frames are too large for cycles (static).
 
-    Gradients: none (the start is cut).
+    Gradients: none; asking for them raises a TypeError.
     """
 
     hypotheses: int = eqx.field(static=True, default=32)
@@ -62,15 +67,15 @@ class CycleConsensus(AbstractAverager):
         key: Key | None,
     ) -> AveragingSolution:
         """Finds a start for a prepared graph; `edge_weight` is trust by cycles."""
-        if not judged(graph, self.max_cycles):
-            return _by_trees(graph)
         held = jax.lax.stop_gradient(graph)
+        if not judged(held, self.max_cycles):
+            return of_start(self, graph, _by_trees(held))
         search = _Search(held, self.hypotheses, self.rounds)
         best = search.init(key)
         # Most graphs are done: the search is compiled for one that is not.
         if not is_concrete(best.settled) or not best.settled:
             best = _searched(search, best)
-        return _with_trust(held, best)
+        return of_start(self, graph, _with_trust(held, best))
 
 
 class _Best(NamedTuple):
