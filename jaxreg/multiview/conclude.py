@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.status import Status
@@ -41,13 +42,14 @@ def finish(
         motions: of pairs, in the scans' centred frames; some may be padding.
         hold: old frames that stay, or None.
     """
+    moving, scans = scans, lax.stop_gradient(scans)
     least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
     placement = place(motions, scans.num_scans, averaging, least)
     mode, turns = placement.mode, turnable(motions, placement)
-    placement = refine(scans, placement, averaging, least - _VOUCHED)
+    placement = refine(moving, placement, averaging, least - _VOUCHED)
     if hold is None:
         free = turns | slipping(scans, placement, least)
-        return _solution(scans, motions, mode, placement, free, least)
+        return _solution(moving, motions, mode, placement, free, least)
     placement = hold.place(scans, placement, averaging, least - _VOUCHED)
     free = (turns | slipping(scans, placement, least)) & ~hold.held
     solution = _solution(scans, motions, mode, placement, free, least)

@@ -102,7 +102,11 @@ def reconstruct(
         of largest overlap have them.
 
     Gradients:
-        None; the search is cut.
+        Of `T_world_i`, by the points of all scans: implicit where the last steps of
+        each pair came to rest, with matches and trust in pairs held, and through the
+        averaging, as that method says. All pairs are then registered, as under `jit`.
+        Of scans that are not placed they are finite, but mean nothing. Settings have no
+        influence, and what else the solution holds has no derivative.
 
     Reference:
         Sandhu, Dambreville, Tannenbaum for the pairs; Zhu et al. for the averaging.
@@ -116,7 +120,6 @@ def reconstruct(
     eyes = checked_viewpoints(far.viewpoints(viewpoints), points, row_mask)
     positions, previous = far.positions(positions), far.previous(previous)
     on_pairs = far.hears(on_pairs)
-    points, eyes = jax.lax.stop_gradient((points, eyes))
     method = ParticleFilter() if method is None else method
     check_method(method, AbstractRegistrar)
     check_instance(averaging, "averaging", AbstractAverager | None)
@@ -163,7 +166,8 @@ def _of_all_pairs(
     """What can be traced: no pair is chosen by what others told."""
     prepared = prepare_scans(method, *inputs)
     pairs = jnp.asarray(all_pairs(prepared.num_scans))
-    motions = relative_motions(method, prepared, pairs, key)
+    method, held = jax.lax.stop_gradient((method, prepared))
+    motions = relative_motions(method, held, pairs, key)
     return finish(method, averaging, prepared, motions)
 
 

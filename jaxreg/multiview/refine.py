@@ -11,7 +11,7 @@ are not noise but warps, which the median of many pairs evens out.)
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.typing import Motion, Scalar
@@ -19,6 +19,7 @@ from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import NO_EVIDENCE, PlaneToPlane, Problem
+from jaxreg.multiview.follow_points import follow_points
 from jaxreg.multiview.place import Placement, part_sizes, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -39,6 +40,9 @@ def refine(
 ) -> Placement:
     """Poses from all pairs of placed scans that overlap, measured anew.
 
+    They have derivatives by the points of the scans: of the last round, which matches
+    are held in.
+
     Args:
         scans: prepared scans.
         placement: poses of the centred frames, and which scans hang together.
@@ -50,8 +54,12 @@ def refine(
         poses, but are alone.
     """
     averaging = wide_unless_given(averaging)
+    moving, scans = scans, lax.stop_gradient(scans)
     for exact in (False, True):
         motions = measured(scans, placement, least, exact=exact)
+        if exact:
+            optimiser, width = _optimiser(motions.T_i_j), _widths(moving, placement)[-1]
+            motions = follow_points(moving, motions, optimiser, width, least)
         again = place(motions, scans.num_scans, averaging, least)
         placement = _updated(placement, again)
     return placement
@@ -89,12 +97,9 @@ def measured(
     scans: PreparedScans, placement: Placement, least: Scalar, *, exact: bool
 ) -> RelativeMotions:
     """The motion and overlap of every pair of a part near the present poses, m = 1."""
-    T_world_i, alone = placement.T_world_i, part_sizes(placement.part) == 1
-    spacing = jnp.max(jnp.where(alone, 0, scans.spacing))
-    factors = _EXACT_WIDTHS if exact else _TABLE_WIDTHS
-    widths = spacing * jnp.asarray(factors, spacing.dtype)
-    optimiser = LocalOptimiser(PlaneToPlane(0.01), GemanMcClure(), GaussNewton())
-    optimiser = cast_floats(optimiser, T_world_i.dtype)
+    T_world_i = placement.T_world_i
+    widths = _widths(scans, placement, exact=exact)
+    optimiser = _optimiser(T_world_i)
 
     def measured(pair: Array) -> Motion:
         i, j = pair
@@ -114,6 +119,21 @@ def measured(
 
     pairs = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
     return lax.map(one, pairs)
+
+
+def _optimiser(like: Array) -> LocalOptimiser:
+    optimiser = LocalOptimiser(PlaneToPlane(0.01), GemanMcClure(), GaussNewton())
+    return cast_floats(optimiser, like.dtype)
+
+
+def _widths(
+    scans: PreparedScans, placement: Placement, *, exact: bool = True
+) -> Float[Array, " s"]:
+    """Kernel widths of the steps."""
+    alone = part_sizes(placement.part) == 1
+    spacing = jnp.max(jnp.where(alone, 0, scans.spacing))
+    factors = _EXACT_WIDTHS if exact else _TABLE_WIDTHS
+    return spacing * jnp.asarray(factors, spacing.dtype)
 
 
 def _problem(scans: PreparedScans, i: Array, j: Array, exact: bool = False) -> Problem:
