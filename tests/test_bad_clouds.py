@@ -102,6 +102,6 @@ def test_a_guess_that_is_not_rigid_is_refused(scale):
 def test_a_guess_beyond_all_numbers_on_the_map_has_a_status():
     source, target, T_true = _far(0)
     lost = T_true.copy()
-    lost[0, 3] = 1e300
+    lost[0, 3] = 1e38
     sol = jr.register(source, target, jr.ICP(), init=lost)
     assert int(sol.status) == Status.NON_FINITE

@@ -58,7 +58,7 @@ def sloped():
 
 
 def test_slopes_are_those_of_central_differences(scans, sloped):
-    # The last four steps of a pair lead so near to rest; after twelve they agree to 2e-3.
+    # So near to rest lead the last four steps of a pair; twelve lead twice as near.
     near = 5e-3
     (_, status), (slopes, by_points) = sloped(scans)
     assert status == Status.CONVERGED
