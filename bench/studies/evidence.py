@@ -1,10 +1,10 @@
-"""How the three numbers of the evidence were found, and what it is worth elsewhere.
+"""How the numbers of the evidence were found, and what it is worth elsewhere.
 
     python -m bench.studies.evidence collect --out DIR
     python -m bench.studies.evidence report --out DIR
 
 The first registers all pairs in hand and writes a file of JSON lines per kind of data:
-of each mode the two numbers that evidence is made of, and its errors. A process a kind
+of each mode the numbers that evidence is made of, and its errors. A process a kind
 (`--only`) spares the memory of the compiler. The second finds the discriminant on the
 generated and every other one of the real pairs, checks it on the rest and on kinds that
 it was not found on, and draws the reliability of the answers.
@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
-from bench.studies.evidence_modes import modes_of
+from bench.studies.evidence_modes import NUMBERS, modes_of
 from bench.studies.evidence_pairs import GENERATED, KINDS
 from bench.studies.reliability import Reliability, draw
 from jaxreg.matching import evidence
@@ -39,8 +39,8 @@ _PLOT = Path(__file__).parents[1] / "plots" / "evidence_reliability.png"
 class Examples(NamedTuple):
     """Best right and best wrong modes of pairs.
 
-    `numbers` `(n, 2)` are log gain and near, `right` `(n,)` 1 or 0, `pair` `(n,)` the
-    place of the pair in its kind.
+    `numbers` `(n, 3)` are log gain, near and patch, `right` `(n,)` 1 or 0, `pair`
+    `(n,)` the place of the pair in its kind.
     """
 
     numbers: np.ndarray
@@ -81,18 +81,21 @@ def discriminants(examples: dict[str, Examples]) -> Iterator[str]:
     """Found on one half, checked on the other; and without one kind after another."""
     choose = [x if k in GENERATED else x.of_half(0) for k, x in examples.items()]
     check = {k: x.of_half(1) for k, x in examples.items() if k not in GENERATED}
-    found, code = fitted(choose), [evidence._GAIN, evidence._NEAR, -evidence._OFFSET]
-    yield "| | log gain | near | offset | examples | loss | AUC |"
-    yield "|---|---|---|---|---|---|---|"
-    every = _joined(examples.values())
+    found = fitted(choose)
+    code = evidence._GAIN, evidence._NEAR, evidence._FALL, -evidence._OFFSET
+    yield "| | log gain | near | patch | offset | examples | loss | AUC |"
+    yield "|---|---|---|---|---|---|---|---|"
+    every, second = _joined(examples.values()), _joined(check.values())
     for name, numbers, told in (
         ("found on the first half", found, _joined(choose)),
-        ("checked on the second", found, _joined(check.values())),
+        ("checked on the second", found, second),
         ("in the code, all", code, every),
+        ("in the code, second half", code, second),
+        ("without patch, second half", (*code[:2], 0, code[3]), second),
         ("found on all", fitted(list(examples.values())), every),
     ):
-        three = " | ".join(f"{x:.1f}" for x in numbers)
-        yield f"| {name} | {three} | {len(told.right)} | {_quality(numbers, told)} |"
+        four = " | ".join(f"{x:.1f}" for x in numbers)
+        yield f"| {name} | {four} | {len(told.right)} | {_quality(numbers, told)} |"
     yield "\n| found without | right, wrong | loss | AUC | right above the best wrong |"
     yield "|---|---|---|---|---|"
     apart = []
@@ -110,7 +113,7 @@ def discriminants(examples: dict[str, Examples]) -> Iterator[str]:
 
 
 def fitted(examples: list[Examples]) -> np.ndarray:
-    """`(3,)` weights of log gain and near and the offset, by logistic regression."""
+    """`(4,)` weights of the numbers and the offset, by logistic regression."""
     told = _joined(examples)
     mean, width = told.numbers.mean(axis=0), told.numbers.std(axis=0)
     rows = np.column_stack([(told.numbers - mean) / width, np.ones(len(told.right))])
@@ -118,11 +121,11 @@ def fitted(examples: list[Examples]) -> np.ndarray:
 
     def loss(b: np.ndarray) -> float:
         # A slight pull to zero: halves may be separable.
-        return np.logaddexp(0, -sign * (rows @ b)).sum() + 0.05 * np.sum(b[:2] ** 2)
+        return np.logaddexp(0, -sign * (rows @ b)).sum() + 0.05 * np.sum(b[:-1] ** 2)
 
-    b = minimize(loss, np.zeros(3), method="BFGS").x
-    slope = b[:2] / width
-    return np.append(slope, b[2] - slope @ mean)
+    b = minimize(loss, np.zeros(rows.shape[1]), method="BFGS").x
+    slope = b[:-1] / width
+    return np.append(slope, b[-1] - slope @ mean)
 
 
 def choices(rows: dict[str, list[dict[str, Any]]]) -> Iterator[str]:
@@ -192,7 +195,7 @@ def _examples(rows: list[dict[str, Any]]) -> Examples:
             (0.0, [m for m in ordered if _is_wrong(m)]),
         ):
             for mode in some[:1]:
-                numbers.append([mode["log_gain"], mode["near"]])
+                numbers.append([mode[name] for name in NUMBERS])
                 right.append(wanted)
                 pair.append(at)
     return Examples(np.array(numbers), np.array(right), np.array(pair))
@@ -218,7 +221,7 @@ def _joined(examples: Any) -> Examples:
 
 
 def _scores(numbers: Any, told: Examples) -> np.ndarray:
-    return told.numbers @ np.asarray(numbers[:2]) + numbers[2]
+    return told.numbers @ np.asarray(numbers[:-1]) + numbers[-1]
 
 
 def _loss(scores: np.ndarray, right: np.ndarray) -> float:

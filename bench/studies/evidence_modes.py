@@ -17,12 +17,14 @@ from jaxreg.particle.conclude import Pair as Prepared
 from jaxreg.registrar import prepare_pair
 
 
+#: What evidence is made of.
+NUMBERS = "log_gain", "near", "patch"
 # Sizes that clouds are padded to: each is compiled once.
 _SIZES = 8192, 32768, 49152, 98304, 327680
 
 
 def modes_of(pair: Pair, key: int) -> dict[str, Any]:
-    """Modes with log gain, near, and errors in degrees and tolerances; for JSON."""
+    """Modes with their numbers, and errors in degrees and tolerances; for JSON."""
     clouds = padded(pair.source, pair.target)
     source, target, *masks = clouds
     found = register(
@@ -35,10 +37,10 @@ def modes_of(pair: Pair, key: int) -> dict[str, Any]:
     T = found.modes.T_target_source
     numbers = found.modes.log_evidence, *_numbers(clouds, T)
     told = zip(*map(np.asarray, numbers), strict=True)
-    names = "log_evidence", "log_gain", "near", "degrees", "tolerances"
+    names = "log_evidence", *NUMBERS, "degrees", "tolerances"
     modes = [
-        dict(zip(names, map(float, (*three, *pair.errors(pose))), strict=True))
-        for three, pose, weight in zip(
+        dict(zip(names, map(float, (*four, *pair.errors(pose))), strict=True))
+        for four, pose, weight in zip(
             told, np.asarray(T, float), np.asarray(found.modes.weight), strict=True
         )
         if weight > 0
@@ -66,20 +68,21 @@ def padded(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 @eqx.filter_jit
-def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`(q,)` log gain and near of poses `(q, 4, 4)`, as the evidence has them."""
+def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, ...]:
+    """`(q,)` the numbers of poses `(q, 4, 4)`, as the evidence has them."""
     ready = prepare_pair(ParticleFilter(), tuple(map(jnp.asarray, clouds)))
     pair = ready.source, ready.target
     indexes = (BruteForce.build(cloud.points, cloud.mask) for cloud in pair)
     witness = Prepared(*pair, *indexes).judged.exact.witness
     (there, back), (own, other) = witness.problems, witness.spacings
 
-    def of_pose(T: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def of_pose(T: jax.Array) -> tuple[jax.Array, ...]:
         to = evidence._one_way(there, T, own, other, witness.shares[0], witness.chance)
         fro = evidence._one_way(
             back, lie.inverse(T), other, own, witness.shares[1], witness.chance
         )
         gain = jnp.maximum((to.gain + fro.gain) / 2, evidence._LEAST_GAIN)
-        return jnp.log(gain), jnp.sqrt(to.near * fro.near)
+        near = jnp.sqrt(to.near * fro.near)
+        return jnp.log(gain), near, evidence._patch(to, fro)
 
     return lax.map(of_pose, jax.vmap(ready.frames.enter)(T))
