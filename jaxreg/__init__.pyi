@@ -32,6 +32,7 @@ from .local import ClosedForm as ClosedForm
 from .local import GaussNewton as GaussNewton
 from .local import GradientDescent as GradientDescent
 from .local import LevenbergMarquardt as LevenbergMarquardt
+from .local import OptimistixStep as OptimistixStep
 from .matching import AbstractResidual as AbstractResidual
 from .matching import PlaneToPlane as PlaneToPlane
 from .matching import PointToPlane as PointToPlane

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 
 import jaxreg as jr
 from jaxreg import particle, robust
@@ -124,6 +125,7 @@ STEPS: list[tuple[jr.AbstractStep, jr.AbstractResidual]] = [
     (jr.GaussNewton(), jr.Symmetric()),
     (jr.GradientDescent(), jr.PointToPlane()),
     (jr.LevenbergMarquardt(), jr.PlaneToPlane()),
+    (jr.OptimistixStep(optimistix.BFGS(1e-9, 1e-9)), jr.PlaneToPlane()),
 ]
 DYNAMICS = [
     particle.NoDynamics(),

@@ -104,6 +104,29 @@ def inverse_semidefinite(A: Float[Array, "*b k k"]) -> Float[Array, "*b k k"]:
     return _stacked(rows)
 
 
+def root_semidefinite(
+    A: Float[Array, "*b k k"], b: Float[Array, "*b k"]
+) -> tuple[Float[Array, "*b k k"], Float[Array, "*b k"]]:
+    """R and r with R^T R = A and R^T r = b, for positive semidefinite A.
+
+    R = D^1/2 L^T of the factors A = L D L^T. Rows of directions that A leaves free, and
+    what of b is along these, are zero. The lower triangles are read.
+    """
+    k = b.shape[-1]
+    L, pivots = _factors(A)
+    x = [b[..., i] for i in range(k)]
+    for i in range(k):
+        x[i] = x[i] - sum(L[i][m] * x[m] for m in range(i))
+    shrink = [jnp.sqrt(p) for p in pivots]
+    grow = [jnp.where(p > 0, 1 / jnp.where(p > 0, p, 1), 0) for p in shrink]
+    zero = jnp.zeros_like(pivots[0])
+    rows = [
+        [zero] * i + [grow[i]] + [grow[i] * L[j][i] for j in range(i + 1, k)]
+        for i in range(k)
+    ]
+    return _stacked(rows), jnp.stack([shrink[i] * x[i] for i in range(k)], axis=-1)
+
+
 def _factors(A: Array) -> tuple[list[list[Array]], list[Array]]:
     """Rows of L below its unit diagonal, and the inverse pivots; zero for free ones."""
     k = A.shape[-1]

@@ -13,6 +13,7 @@ from jaxreg.local.steps import ClosedForm as ClosedForm
 from jaxreg.local.steps import GaussNewton as GaussNewton
 from jaxreg.local.steps import GradientDescent as GradientDescent
 from jaxreg.local.steps import LevenbergMarquardt as LevenbergMarquardt
+from jaxreg.local.steps import OptimistixStep as OptimistixStep
 from jaxreg.local.steps import condition as condition
 from jaxreg.local.steps import decoupled_error as decoupled_error
 from jaxreg.local.steps import gyration_radius as gyration_radius

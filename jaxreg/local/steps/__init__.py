@@ -9,5 +9,6 @@ from jaxreg.local.steps.gradient_descent import GradientDescent as GradientDesce
 from jaxreg.local.steps.levenberg_marquardt import (
     LevenbergMarquardt as LevenbergMarquardt,
 )
+from jaxreg.local.steps.optimistix_step import OptimistixStep as OptimistixStep
 from jaxreg.local.steps.scaling import condition as condition
 from jaxreg.local.steps.scaling import gyration_radius as gyration_radius

@@ -21,11 +21,13 @@ class Scaled(eqx.Module):
         H: `(k, k)`; the mean of its translation's diagonal is one.
         b: `(k,)`.
         unit: `(k,)` what one unit of the solution is in the tangent.
+        scale: one over the stiffness: what H and b were multiplied by.
     """
 
     H: Float[Array, "k k"]
     b: Float[Array, " k"]
     unit: Float[Array, " k"]
+    scale: Float[Array, ""]
 
     @classmethod
     def of(
@@ -44,7 +46,7 @@ class Scaled(eqx.Module):
             [jnp.ones(d, H.dtype), jnp.broadcast_to(turn, (b.shape[0] - d,))]
         )
         scale = jnp.where(stiffness > 0, 1 / jnp.where(stiffness > 0, stiffness, 1), 0)
-        return cls(scale * H * unit[:, None] * unit, scale * b * unit, unit)
+        return cls(scale * H * unit[:, None] * unit, scale * b * unit, unit, scale)
 
     def solve(self, damping: Float[Array, ""] | float) -> Float[Array, " k"]:
         """The tangent (v, w) that solves (H + damping I) x = b.
