@@ -1,11 +1,12 @@
-"""Solvers of optimistix as parts of methods.
+"""Solvers of optimistix and of lineax as parts of methods.
 
-optimistix is imported by whoever hands over one of its solvers, and here once there is
-one: all others need not wait for it.
+Their numbers, which are Python floats there, are traced: another tolerance compiles
+nothing. optimistix is imported by whoever hands over one of its solvers, and here once
+there is one: all others need not wait for it.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -24,11 +25,8 @@ class Lowered(NamedTuple):
     num_steps: Int[Array, ""]
 
 
-class Solver(eqx.Module):
-    """A minimiser or a least-squares solver of optimistix.
-
-    Its numbers, which are Python floats there, are traced: another tolerance compiles
-    nothing. All else, such as the norm that it ends by, is static.
+class AbstractParted(eqx.Module):
+    """A solver, its numbers apart from what is static, such as its norm.
 
     Attributes:
         numbers: the solver with nothing but its numbers, as arrays.
@@ -38,12 +36,54 @@ class Solver(eqx.Module):
     numbers: Any
     rest: Any = eqx.field(static=True)
 
+    def whole(self, dtype: Any) -> Any:
+        """The solver, with numbers of that dtype."""
+        return eqx.combine(cast_floats(self.numbers, dtype), self.rest)
+
+    def __repr__(self) -> str:
+        fields = vars(self.numbers).items()
+        shown = [f"{k}={v:.6g}" for k, v in fields if eqx.is_array(v) and not v.ndim]
+        return f"{type(self.rest).__name__}({', '.join(shown)})"
+
+
+Kind = TypeVar("Kind", bound=AbstractParted)
+
+
+def _parted(kind: type[Kind], solver: object) -> Kind:
+    """Takes a solver apart."""
+    traced = jax.tree.map(
+        lambda x: jnp.asarray(x, float) if type(x) is float else x, solver
+    )
+    return kind(*eqx.partition(traced, eqx.is_array))
+
+
+class LinearSolver(AbstractParted):
+    """A solver of lineax."""
+
+    @classmethod
+    def of(cls, solver: object, name: str) -> "LinearSolver":
+        """Takes a solver of lineax apart, if it is not yet; else raises a TypeError."""
+        if isinstance(solver, cls):
+            return solver
+        import lineax
+
+        if not isinstance(solver, lineax.AbstractLinearSolver):
+            raise TypeError(
+                f"{name}: wanted a solver of lineax such as lineax.Cholesky(), found "
+                f"{told(solver, lineax.AbstractLinearSolver)}."
+            )
+        return _parted(cls, solver)
+
+
+class Solver(AbstractParted):
+    """A minimiser or a least-squares solver of optimistix."""
+
     @classmethod
     def of(cls, solver: object, name: str) -> "Solver":
-        """Takes a solver apart.
+        """Takes a solver apart, if it is not yet.
 
         Args:
-            solver: of optimistix, or one that was taken apart.
+            solver: of optimistix.
             name: how error messages call it.
 
         Raises:
@@ -60,10 +100,7 @@ class Solver(eqx.Module):
                 "such as optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-6), found "
                 f"{told(solver, optimistix.AbstractIterativeSolver)}."
             )
-        traced = jax.tree.map(
-            lambda x: jnp.asarray(x, float) if type(x) is float else x, solver
-        )
-        return cls(*eqx.partition(traced, eqx.is_array))
+        return _parted(cls, solver)
 
     @property
     def takes_rows(self) -> bool:
@@ -91,12 +128,11 @@ class Solver(eqx.Module):
 
         # Some of its states are of the default dtype, whatever that of the unknowns.
         wide, dtype = jnp.result_type(float), start.dtype
-        solver = eqx.combine(cast_floats(self.numbers, wide), self.rest)
         run: Any = optimistix.least_squares if self.takes_rows else optimistix.minimise
         small = rows if self.takes_rows else energy
         found = run(
             lambda x, _: small(x.astype(dtype)).astype(wide),
-            solver,
+            self.whole(wide),
             start.astype(wide),
             max_steps=max_steps,
             throw=False,
@@ -106,8 +142,3 @@ class Solver(eqx.Module):
             found.result == optimistix.RESULTS.successful,
             jnp.asarray(found.stats["num_steps"], jnp.int32),
         )
-
-    def __repr__(self) -> str:
-        fields = vars(self.numbers).items()
-        shown = [f"{k}={v:.6g}" for k, v in fields if eqx.is_array(v) and not v.ndim]
-        return f"{type(self.rest).__name__}({', '.join(shown)})"

@@ -47,7 +47,7 @@ class AveragingSolution(eqx.Module):
             worth (`jaxreg.averaging.likelihood`). At most 0: nothing agrees beyond
             what a tree agrees with by itself; poses of one graph compare by it.
         length_scale: the length that stands for one radian; see `length_scale`.
-        trace: how the method came to rest, or None if it takes no steps.
+        trace: how the method came to rest, or None if it takes no steps of its own.
     """
 
     T_world_i: Float[Array, "v D D"]

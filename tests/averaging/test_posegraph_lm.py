@@ -1,6 +1,11 @@
+import dataclasses
+
+import chex
 import jax
 import jax.numpy as jnp
+import lineax
 import numpy as np
+import optimistix
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -147,3 +152,45 @@ def test_certified_optima_from_the_motions_alone(name, optimum):
         assert solution.status == Status.CONVERGED
         value = chordal_objective(graph, solution.T_world_i)
     np.testing.assert_allclose(value, optimum, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [optimistix.LevenbergMarquardt(1e-10, 1e-10), optimistix.BFGS(1e-10, 1e-10)],
+    ids=lambda s: type(s).__name__,
+)
+def test_solvers_of_optimistix_end_at_the_same_minimum(solver):
+    X, edges, T, weight, information, _ = problem(3, outliers=0.2)
+    with jax.enable_x64(True):
+        graph = PoseGraph.from_edges(edges, T, N, weight, information)
+        ours = PoseGraphLM(kernel=GemanMcClure(), tolerance=1e-13, max_steps=200)
+        theirs = dataclasses.replace(ours, solver=solver, tolerance=1e-9)
+        found = average(graph, theirs, init=X)
+        expected = average(graph, ours, init=X)
+        assert found.status == Status.CONVERGED
+        assert np.abs(expected.T_world_i - X).max() > 1e-2
+        chex.assert_trees_all_close(found.T_world_i, expected.T_world_i, atol=1e-6)
+        chex.assert_trees_all_close(found.edge_weight, expected.edge_weight, atol=1e-6)
+
+
+@pytest.mark.parametrize("linear", [lineax.Cholesky(), lineax.CG(1e-10, 1e-10)])
+def test_solvers_of_lineax_take_the_same_steps(linear):
+    X, edges, T, weight, information, _ = problem(2)
+    weight[edges[:, 1] == N - 1] = weight[edges[:, 0] == N - 1] = 0  # one pose is free
+    with jax.enable_x64(True):
+        graph = PoseGraph.from_edges(edges, T, N, weight, information)
+        ours = PoseGraphLM(tolerance=1e-12)
+        found = average(graph, dataclasses.replace(ours, linear_solver=linear), init=X)
+        expected = average(graph, ours, init=X)
+        assert found.status == expected.status == Status.DISCONNECTED
+        assert found.num_steps <= expected.num_steps
+        chex.assert_trees_all_close(found.T_world_i, expected.T_world_i, atol=1e-7)
+
+
+def test_what_is_no_solver_is_refused():
+    with pytest.raises(TypeError, match="PoseGraphLM: solver: wanted a minimiser"):
+        PoseGraphLM(solver=lineax.Cholesky())
+    with pytest.raises(TypeError, match="linear_solver: wanted a solver of lineax"):
+        PoseGraphLM(linear_solver=optimistix.BFGS(1e-6, 1e-6))
+    with pytest.raises(ValueError, match="one of their own"):
+        PoseGraphLM(solver=optimistix.BFGS(1e-6, 1e-6), linear_solver=lineax.Cholesky())

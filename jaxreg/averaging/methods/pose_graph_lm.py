@@ -15,6 +15,7 @@ from jaxreg._core.checks import (
     check_parts,
     check_positive,
 )
+from jaxreg._core.solver import LinearSolver, Solver
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -23,17 +24,30 @@ from jaxreg.averaging.base import (
     starting_poses,
 )
 from jaxreg.averaging.methods.motion_averaging import MotionAveraging
+from jaxreg.averaging.steps.charts import Minimum as SolverMinimum
+from jaxreg.averaging.steps.charts import minimise_by
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError, LogError
 from jaxreg.averaging.steps.implicit import differentiable
 from jaxreg.averaging.steps.levenberg_marquardt import (
+    Minimum,
     Problem,
     minimise,
     robust_problem,
 )
+from jaxreg.averaging.trace import AveragingTrace
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.multigrid import multigrid
 from jaxreg.linear.operator import GraphLaplacian, divergence
 from jaxreg.robust import AbstractKernel
+
+
+def _solver(found: object) -> Solver | None:
+    return None if found is None else Solver.of(found, "PoseGraphLM: solver")
+
+
+def _linear_solver(found: object) -> LinearSolver | None:
+    told = "PoseGraphLM: linear_solver"
+    return None if found is None else LinearSolver.of(found, told)
 
 
 class PoseGraphLM(AbstractAverager):
@@ -52,6 +66,12 @@ class PoseGraphLM(AbstractAverager):
         tolerance: stop when the next step would lower the objective by less than this
             share, by the ratio of the last two.
         initialiser: finds the start when `init` is None.
+        solver: a minimiser or a least-squares solver of optimistix in place of the
+            steps here. It works on tangents around the poses, and is started anew
+            around those that it found until that changes nothing; `max_steps` is then
+            that of each start, and there is no trace. Its numbers are traced.
+        linear_solver: a solver of lineax for the normal equations of the steps here, in
+            place of conjugate gradients under a multigrid cycle.
 
     The length unit matters without information, as an error of one radian counts as
     one of a unit length. `edge_weight` is the kernel's.
@@ -70,6 +90,10 @@ class PoseGraphLM(AbstractAverager):
     initialiser: AbstractAverager = eqx.field(
         default_factory=lambda: MotionAveraging(max_steps=3)
     )
+    solver: Solver | None = eqx.field(default=None, converter=_solver)
+    linear_solver: LinearSolver | None = eqx.field(
+        default=None, converter=_linear_solver
+    )
 
     def __check_init__(self) -> None:
         """Refuses parts, counts and numbers that it cannot use."""
@@ -82,6 +106,11 @@ class PoseGraphLM(AbstractAverager):
         check_counts(self, max_steps=1)
         check_positive(self, "kernel_width")
         check_not_negative(self, "tolerance")
+        if self.solver is not None and self.linear_solver is not None:
+            raise ValueError(
+                "PoseGraphLM: linear_solver: the steps of `solver` have one of their "
+                "own; give it to that, or leave out one of both."
+            )
 
     @eqx.filter_jit
     def solve(
@@ -96,7 +125,7 @@ class PoseGraphLM(AbstractAverager):
             starting_poses(self.initialiser, fixed, init, key)
         )
         problem = held._problem(fixed)
-        end = minimise(problem, T_start, self.max_steps, held.tolerance)
+        end, trace = held._minimum(problem, T_start)
         T = self._with_gradients(graph, problem, end.T)
         problem = self._problem(graph)
         return solution(
@@ -105,8 +134,18 @@ class PoseGraphLM(AbstractAverager):
             edge_weight=problem.trust(problem.squares(T)),
             converged=end.converged,
             num_steps=end.step,
-            trace=end.trace,
+            trace=trace,
         )
+
+    def _minimum(
+        self, problem: Problem, T_start: Float[Array, "v D D"]
+    ) -> tuple[Minimum | SolverMinimum, AveragingTrace | None]:
+        """By our steps or by those of the solver."""
+        start = problem, T_start, self.max_steps, self.tolerance
+        if self.solver is not None:
+            return minimise_by(self.solver, *start), None
+        end = minimise(*start, linear_solver=self.linear_solver)
+        return end, end.trace
 
     def _with_gradients(
         self, graph: PoseGraph, problem: Problem, T: Float[Array, "v D D"]

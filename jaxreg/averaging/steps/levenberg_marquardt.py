@@ -15,9 +15,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.loop import AbstractIteration, iterate
+from jaxreg._core.solver import LinearSolver
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.measures import length_scale, weighted_mean
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError
@@ -39,7 +41,7 @@ _STALE, _MOVED = 2, 0.3
 # of the diagonal holds back the bending of a long chain, so that steps converge slowly.
 _DAMPED = 1e-6
 # A sum of the costs of edges is known to so many units of rounding.
-_ROUNDING = 8
+ROUNDING = 8
 
 
 class Problem(NamedTuple):
@@ -53,8 +55,12 @@ class Problem(NamedTuple):
 
     def squares(self, T: Array) -> Array:
         """The squared error r' Omega r of each edge."""
-        r = self.error.value(_predicted(self.graph, T), self.graph.T_i_j)
+        r = self.errors(T)
         return jnp.sum(r * self._weighted(r[..., None])[..., 0], axis=-1)
+
+    def errors(self, T: Array) -> Array:
+        """The error r of each edge."""
+        return self.error.value(_predicted(self.graph, T), self.graph.T_i_j)
 
     def _weighted(self, J: Array) -> Array:
         if self.precision.ndim == 2:
@@ -133,14 +139,16 @@ def minimise(
     max_steps: int,
     tolerance: Array | float,
     cycle: Cycle | None = None,
+    linear_solver: LinearSolver | None = None,
 ) -> Minimum:
     """Steps until the next would lower the objective by less than `tolerance` of it.
 
-    `cycle` may be that of a similar problem.
+    `cycle` may be that of a similar problem; a `linear_solver` solves without one.
     """
     limit = jnp.maximum(tolerance, 4 * jnp.finfo(T_start.dtype).eps)
     cycle = no_cycle(problem, T_start) if cycle is None else cycle
-    descent = _Descent(problem, length_scale(problem.graph), limit, max_steps)
+    length = length_scale(problem.graph)
+    descent = _Descent(problem, length, limit, max_steps, linear_solver)
     ended = iterate(descent, descent.init((T_start, cycle)), max_steps=max_steps)
     end = ended.state
     trace = AveragingTrace.of(end.rows, end.num_steps)
@@ -168,6 +176,7 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
     length: Scalar
     limit: Scalar
     max_steps: int
+    linear_solver: LinearSolver | None
 
     def init(self, start: tuple[Array, Cycle]) -> _State:
         T, cycle = start
@@ -197,13 +206,15 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         graph = problem.graph
         matrix = GraphLaplacian.anchored(graph.edges, Q, graph.num_poses, s.damping)
         kept = (s.cycle.usual > 0) & (s.cycle.moved < _MOVED * self.length)
-        inverse = jax.lax.cond(kept, lambda: s.cycle.inverse, lambda: multigrid(matrix))
-        x, rounds = _tangents(matrix, force, inverse)
+        inverse = s.cycle.inverse
+        if self.linear_solver is None:
+            inverse = jax.lax.cond(kept, lambda: inverse, lambda: multigrid(matrix))
+        x, rounds = _tangents(matrix, force, self.linear_solver or inverse)
         T = nearby_rotation(product(lie.exp(x), s.T))
         cost = problem.cost(T)
         # Poses are known better than their cost: a step that is lost in its rounding
         # may still be right.
-        better = cost <= s.cost * (1 + _ROUNDING * jnp.finfo(cost.dtype).eps)
+        better = cost <= s.cost * (1 + ROUNDING * jnp.finfo(cost.dtype).eps)
         gain = jnp.where(
             s.cost > 0, (s.cost - cost) / jnp.where(s.cost > 0, s.cost, 1), 0
         )
@@ -241,17 +252,24 @@ def _predicted(graph: PoseGraph, T: Array) -> Array:
 
 
 def _tangents(
-    matrix: GraphLaplacian, force: Array, inverse: Multigrid
+    matrix: GraphLaplacian, force: Array, solver: Multigrid | LinearSolver
 ) -> tuple[Array, Array]:
     """Left tangents x of the normal equations B' Q B x = -B' f, and the rounds.
 
     Pose 0 and poses that no weight holds stay.
     """
     rhs = -divergence(matrix.edges, force, len(matrix.own))[..., None]
-    solver = MultigridCG(STEP_TOLERANCE, max_steps=300)
-    state = solver.init(matrix, {"preconditioner": inverse})
-    x, _, stats = solver.compute(state, rhs, {})
-    # Damping leaves pose 0 some of the motion that all share.
     held = jnp.trace(matrix.blocks(), axis1=-2, axis2=-1) > 0
-    x = jnp.where(held[:, None], x[..., 0] - x[0, :, 0], 0)
-    return x, stats["num_steps"]
+    if isinstance(solver, LinearSolver):
+        eye = jnp.eye(rhs.shape[1], dtype=rhs.dtype)
+        own = jnp.where(held[:, None, None], matrix.own, eye)
+        matrix = GraphLaplacian(matrix.edges, matrix.weight, own)
+        x = lx.linear_solve(matrix, rhs, solver.whole(rhs.dtype), throw=False).value
+        rounds = jnp.asarray(0, jnp.int32)
+    else:
+        ours = MultigridCG(STEP_TOLERANCE, max_steps=300)
+        state = ours.init(matrix, {"preconditioner": solver})
+        x, _, stats = ours.compute(state, rhs, {})
+        rounds = stats["num_steps"]
+    # Damping leaves pose 0 some of the motion that all share.
+    return jnp.where(held[:, None], x[..., 0] - x[0, :, 0], 0), rounds

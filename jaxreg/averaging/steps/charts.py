@@ -1,0 +1,142 @@
+"""Least squares over a graph by a solver of optimistix.
+
+The solver works on one tangent space for all poses, T_world_i <- exp(x_i) T_world_i,
+around those that it starts from. It is started anew around what it found, until that
+changes nothing: so poses stay on the group, and none is far from the middle of its
+tangent space.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core.loop import AbstractIteration, iterate
+from jaxreg._core.solver import Solver
+from jaxreg._core.typing import Scalar
+from jaxreg.averaging.steps.iterate import nearby_rotation
+from jaxreg.averaging.steps.levenberg_marquardt import ROUNDING, Problem
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import product
+from jaxreg.linear.small import root_semidefinite
+
+
+# Of more starts than so many each would have turned poses by another large angle.
+_STARTS = 5
+
+
+class Minimum(NamedTuple):
+    """Where the solver stopped."""
+
+    T: Float[Array, "v D D"]
+    converged: Bool[Array, ""]
+    step: Int[Array, ""]
+
+
+def minimise_by(
+    solver: Solver,
+    problem: Problem,
+    T_start: Float[Array, "v D D"],
+    max_steps: int,
+    tolerance: Array | float,
+) -> Minimum:
+    """Starts a solver until a start lowers the cost by at most `tolerance` of it.
+
+    Args:
+        solver: a minimiser or a least-squares solver.
+        problem: what is made small.
+        T_start: poses to start from.
+        max_steps: of the solver from each start.
+        tolerance: share of the cost.
+    """
+    limit = jnp.maximum(tolerance, 4 * jnp.finfo(T_start.dtype).eps)
+    charts = _Charts(solver, problem, _whitening(problem), limit, max_steps)
+    ended = iterate(charts, charts.init(T_start), max_steps=_STARTS)
+    return Minimum(ended.state.T, ended.converged, ended.state.taken)
+
+
+class _State(NamedTuple):
+    T: Array
+    cost: Array
+    better: Array  # whether the last start led to no higher cost
+    still: Array  # whether it changed nothing, by the solver's and our tolerances
+    num_steps: Array  # starts
+    taken: Array  # steps of the solver
+
+
+class _Charts(AbstractIteration[Array, _State]):
+    solver: Solver
+    problem: Problem
+    whitening: Float[Array, "e m m"]
+    limit: Scalar
+    max_steps: int
+
+    def init(self, start: Array) -> _State:
+        none, no = jnp.asarray(0, jnp.int32), jnp.asarray(False)
+        return _State(start, self.problem.cost(start), ~no, no, none, none)
+
+    def terminate(self, state: _State) -> Bool[Array, ""]:
+        return state.still
+
+    def fail(self, state: _State) -> Bool[Array, ""]:
+        return ~state.better
+
+    def step(self, state: _State) -> _State:
+        """One start of the solver; its poses are kept if the cost does not rise."""
+        s = state
+        k = lie.tangent_dim(self.problem.graph.dim)
+
+        def rows(x: Array) -> Array:
+            return self._rows(s.T, x)
+
+        def energy(x: Array) -> Array:
+            return jnp.sum(rows(x) ** 2) / 2
+
+        zero = jnp.zeros(((len(s.T) - 1) * k,), s.T.dtype)
+        found = self.solver.lower(energy, rows, zero, self.max_steps)
+        T = nearby_rotation(self._moved(s.T, found.x))
+        cost = self.problem.cost(T)
+        better = cost <= s.cost * (1 + ROUNDING * jnp.finfo(cost.dtype).eps)
+        return _State(
+            T=jnp.where(better, T, s.T),
+            cost=jnp.where(better, cost, s.cost),
+            better=better,
+            still=found.converged & better & (s.cost - cost <= self.limit * s.cost),
+            num_steps=s.num_steps + 1,
+            taken=s.taken + found.num_steps,
+        )
+
+    def _moved(self, T: Array, x: Array) -> Array:
+        """The poses at tangents of all but pose 0; those that no edge holds stay."""
+        tangents = jnp.where(self._held, x.reshape(len(T) - 1, -1), 0)
+        none = jnp.zeros_like(tangents[:1])
+        return product(lie.exp(jnp.concatenate([none, tangents])), T)
+
+    def _rows(self, T: Array, x: Array) -> Array:
+        """Half the sum of their squares is half the cost."""
+        r = self.problem.errors(self._moved(T, x))
+        white = jnp.sum(self.whitening * r[:, None, :], axis=-1)
+        s = jnp.sum(white**2, axis=-1)
+        some = s > 0
+        share = jnp.where(some, self.problem.loss(s) / jnp.where(some, s, 1), 1)
+        white = jnp.sqrt(share)[:, None] * white
+        # Columns of zeros have no factors.
+        free = jnp.where(self._held, 0, x.reshape(len(T) - 1, -1))
+        return jnp.concatenate([white.ravel(), free.ravel()])
+
+    @property
+    def _held(self) -> Bool[Array, "u 1"]:
+        """Which poses but the first an edge of positive weight holds."""
+        graph = self.problem.graph
+        touched = jnp.zeros((graph.num_poses,), bool)
+        for end in (0, 1):
+            touched = touched.at[graph.edges[:, end]].max(graph.weight > 0)
+        return touched[1:, None]
+
+
+def _whitening(problem: Problem) -> Float[Array, "e m m"]:
+    """R with R^T R = Omega."""
+    Omega = problem.precision
+    if Omega.ndim == 2:
+        return jnp.sqrt(Omega)[..., None] * jnp.eye(Omega.shape[-1], dtype=Omega.dtype)
+    return root_semidefinite(Omega, jnp.zeros_like(Omega[..., 0]))[0]
