@@ -52,6 +52,12 @@ REGISTRARS = {
         lambda d: jr.KernelCorrelation(0.25, tolerance=1e-9),
         {**_EXACT, "by": ["bandwidth"], "lengths": True},
     ),
+    "KernelCorrelation by optimistix": Row(
+        lambda d: jr.KernelCorrelation(
+            0.25, 200, solver=optimistix.LevenbergMarquardt(1e-12, 1e-12)
+        ),
+        {**_EXACT, "by": ["bandwidth"], "lengths": True},
+    ),
     "ParticleFilter": Row(
         lambda d: jr.ParticleFilter(
             num_prior=16, num_particles=8, num_times=2, **_SEARCH
@@ -85,6 +91,12 @@ AVERAGERS = {
     ),
     "PoseGraphLM": Row(
         lambda d: jr.PoseGraphLM(tolerance=1e-15), {**_EXACT, "lengths": True}
+    ),
+    "PoseGraphLM by optimistix": Row(
+        lambda d: jr.PoseGraphLM(
+            tolerance=1e-9, solver=optimistix.LevenbergMarquardt(1e-12, 1e-12)
+        ),
+        {**_EXACT, "lengths": True},
     ),
 }
 #: Indexes of closest points.

@@ -52,7 +52,8 @@ from jaxreg.testing.promises import (
 
 #: Whose whole check is left to `-m slow`: each shares its parts with one that is not.
 SLOW = {
-    *("MultiStart", "sandhu2010"),
+    *("MultiStart", "sandhu2010", "KernelCorrelation by optimistix"),
+    "PoseGraphLM by optimistix",
     *("CycleConsensus", "MCC", "WeightedMotionAveraging", "LowRankSparse"),
     *("BoxTree", "CellGrid"),
 }

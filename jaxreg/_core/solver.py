@@ -6,7 +6,7 @@ there is one: all others need not wait for it.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -60,6 +60,8 @@ def _parted(kind: type[Kind], solver: object) -> Kind:
 class LinearSolver(AbstractParted):
     """A solver of lineax."""
 
+    described: ClassVar[str] = "a solver of lineax such as lineax.Cholesky()"
+
     @classmethod
     def of(cls, solver: object, name: str) -> "LinearSolver":
         """Takes a solver of lineax apart, if it is not yet; else raises a TypeError."""
@@ -69,7 +71,7 @@ class LinearSolver(AbstractParted):
 
         if not isinstance(solver, lineax.AbstractLinearSolver):
             raise TypeError(
-                f"{name}: wanted a solver of lineax such as lineax.Cholesky(), found "
+                f"{name}: wanted {cls.described}, found "
                 f"{told(solver, lineax.AbstractLinearSolver)}."
             )
         return _parted(cls, solver)
@@ -77,6 +79,11 @@ class LinearSolver(AbstractParted):
 
 class Solver(AbstractParted):
     """A minimiser or a least-squares solver of optimistix."""
+
+    described: ClassVar[str] = (
+        "a minimiser or a least-squares solver of optimistix such as "
+        "optimistix.BFGS(rtol=1e-6, atol=1e-6)"
+    )
 
     @classmethod
     def of(cls, solver: object, name: str) -> "Solver":
@@ -96,8 +103,7 @@ class Solver(AbstractParted):
         kinds = optimistix.AbstractMinimiser, optimistix.AbstractLeastSquaresSolver
         if not isinstance(solver, kinds):
             raise TypeError(
-                f"{name}: wanted a minimiser or a least-squares solver of optimistix "
-                "such as optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-6), found "
+                f"{name}: wanted {cls.described}, found "
                 f"{told(solver, optimistix.AbstractIterativeSolver)}."
             )
         return _parted(cls, solver)
@@ -118,6 +124,9 @@ class Solver(AbstractParted):
     ) -> Lowered:
         """Makes an energy small; no derivative passes, and no failure raises.
 
+        The functions are pytrees of the arrays that they use, such as `eqx.Partial` and
+        methods of modules: optimistix keeps what it has compiled by them.
+
         Args:
             energy: for minimisers.
             rows: of which `energy` is half the sum of squares, for least squares.
@@ -131,7 +140,7 @@ class Solver(AbstractParted):
         run: Any = optimistix.least_squares if self.takes_rows else optimistix.minimise
         small = rows if self.takes_rows else energy
         found = run(
-            lambda x, _: small(x.astype(dtype)).astype(wide),
+            _Widened(small, dtype),
             self.whole(wide),
             start.astype(wide),
             max_steps=max_steps,
@@ -142,3 +151,13 @@ class Solver(AbstractParted):
             found.result == optimistix.RESULTS.successful,
             jnp.asarray(found.stats["num_steps"], jnp.int32),
         )
+
+
+class _Widened(eqx.Module):
+    """A function of unknowns of a dtype, for those of another."""
+
+    function: Callable[[Array], Array]
+    dtype: Any = eqx.field(static=True)
+
+    def __call__(self, x: Array, args: None) -> Array:
+        return self.function(x.astype(self.dtype)).astype(x.dtype)

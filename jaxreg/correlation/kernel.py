@@ -1,17 +1,22 @@
 """Registration by kernel correlation, the rival in the PF paper's section 5.1."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import cast_floats, traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_positive
-from jaxreg._core.loop import iterate
+from jaxreg._core.loop import iterate, status_of
+from jaxreg._core.restarts import MAX_STARTS
+from jaxreg._core.solver import Solver
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points
 from jaxreg.cloud import PointCloud, median_spacing, thin, without_noise
 from jaxreg.correlation.ascent import Ascending, Maximum, is_free, newton_step
+from jaxreg.correlation.by_solver import Restarting
 from jaxreg.correlation.quadratic import Quadratic, pull_on_target
 from jaxreg.geometry import lie
 from jaxreg.local import at_rest, sandwich, turn_and_shift
@@ -23,6 +28,10 @@ from jaxreg.registrar import AbstractRegistrar, Frames, Modes, RegistrationSolut
 # that is more, in spacings of the coarser cloud's samples.
 _RADII = 0.2
 _SPACINGS = 2.0
+
+
+def _solver(found: object) -> Solver | None:
+    return None if found is None else Solver.of(found, "KernelCorrelation: solver")
 
 
 class KernelCorrelation(AbstractRegistrar):
@@ -71,6 +80,7 @@ class KernelCorrelation(AbstractRegistrar):
     max_steps: int = eqx.field(default=60, static=True)
     max_points: int = eqx.field(default=2048, static=True)
     tolerance: Array | float = traced(1e-4)
+    solver: Solver | None = eqx.field(default=None, converter=_solver)
 
     def __check_init__(self) -> None:
         """Refuses counts and widths that leave nothing to do."""
@@ -109,17 +119,15 @@ class KernelCorrelation(AbstractRegistrar):
         )
         width = self.width(spacing)
         fixed = lax.stop_gradient((source, target, init, width, self.tolerance))
-        ascending = Ascending(*fixed[:2], fixed[3], jnp.asarray(fixed[4]))
-        ended = iterate(ascending, ascending.init(fixed[2]), max_steps=self.max_steps)
-        end = ended.state
+        end = self._ascended(*fixed[:2], fixed[3], fixed[2])
 
         held = Quadratic.at(end.T, *fixed[:2], fixed[3])
         T = turn_and_shift(end.T, newton_step(held, held.b))
-        T = jnp.where(ended.converged, T, end.T)
+        T = jnp.where(end.converged, T, end.T)
         T = at_rest(Maximum(source=source, target=target, bandwidth=width, T=T))[0]
 
         evidence = Witness.of_some(*fixed[:2]).of_pose(lax.stop_gradient(T))
-        status = jnp.where(is_free(held), Status.DEGENERATE, ended.status)
+        status = jnp.where(is_free(held), Status.DEGENERATE, status_of(end.converged))
         status = jnp.where(evidence.overlap > 0, status, Status.LOW_OVERLAP)
         status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
         num_pairs = jnp.sum(source.mask, dtype=dtype) * jnp.sum(
@@ -144,6 +152,26 @@ class KernelCorrelation(AbstractRegistrar):
             modes=Modes.alone(T, *told, covariance),
         )
 
+    def _ascended(
+        self,
+        source: PointCloud,
+        target: PointCloud,
+        width: Float[Array, ""],
+        init: Motion,
+    ) -> "_Ascended":
+        """By Newton's steps or by those of the solver."""
+        tolerance = lax.stop_gradient(jnp.asarray(self.tolerance))
+        if self.solver is None:
+            steps = Ascending(source, target, width, tolerance)
+            ended = iterate(steps, steps.init(init), max_steps=self.max_steps)
+            return _Ascended(ended.state.T, ended.converged, ended.state.num_steps)
+        # At a maximum a step of that size gains about its square.
+        limit = jnp.maximum(tolerance**2, 4 * jnp.finfo(init.dtype).eps)
+        solver = lax.stop_gradient(self.solver)
+        starts = Restarting(solver, source, target, width, limit, self.max_steps)
+        ended = iterate(starts, starts.init(init), max_steps=MAX_STARTS)
+        return _Ascended(ended.state.T, ended.converged, ended.state.taken)
+
     def width(self, spacing: Float[Array, ""]) -> Float[Array, ""]:
         """The bandwidth in the prepared frames, where the target's radius is one.
 
@@ -153,6 +181,14 @@ class KernelCorrelation(AbstractRegistrar):
         if self.bandwidth is None:
             return jnp.maximum(_RADII, _SPACINGS * spacing)
         return jnp.asarray(self.bandwidth)
+
+
+class _Ascended(NamedTuple):
+    """Where the steps ended."""
+
+    T: Motion
+    converged: Bool[Array, ""]
+    num_steps: Int[Array, ""]
 
 
 def _covariance(

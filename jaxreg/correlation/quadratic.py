@@ -28,6 +28,7 @@ class Quadratic(eqx.Module):
         b: `(k,)` its descent direction, zero where the correlation is stationary.
         stiffness: `(k,)` diagonal of the matrix that ICP with these links would use:
             positive wherever any pair is close.
+        links: `(k, k)` that matrix.
         by_source: `(k, n)` what every source point adds to b.
     """
 
@@ -35,6 +36,7 @@ class Quadratic(eqx.Module):
     H: Float[Array, "k k"]
     b: Float[Array, " k"]
     stiffness: Float[Array, " k"]
+    links: Float[Array, "k k"]
     by_source: Float[Array, "k n"]
 
     @classmethod
@@ -58,8 +60,14 @@ class Quadratic(eqx.Module):
         pairs_H = eye[:, :, None] * sums.value - sums.spread / bandwidth**2
         H = _quadratic_form(J, pairs_H) + _bending(lever, sums)
         stiffness = jnp.sum(jnp.sum(J * J, axis=0) * sums.value, axis=1)
+        links = _quadratic_form(J, eye[:, :, None] * sums.value)
         return cls(
-            jnp.sum(sums.value), H, jnp.sum(by_source, axis=1), stiffness, by_source
+            correlation=jnp.sum(sums.value),
+            H=H,
+            b=jnp.sum(by_source, axis=1),
+            stiffness=stiffness,
+            links=links,
+            by_source=by_source,
         )
 
 

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 from helpers import blob, motion, move
 from scipy.optimize import minimize
@@ -271,3 +272,29 @@ def test_settings_that_do_nothing_are_refused():
     for width in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="bandwidth"):
             KernelCorrelation(width)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [optimistix.LevenbergMarquardt(1e-8, 1e-8), optimistix.BFGS(1e-8, 1e-8)],
+    ids=lambda s: type(s).__name__,
+)
+def test_solvers_of_optimistix_end_at_the_best_pose(solver):
+    source, target = blob(N, 2), blob(M, 2, seed=1)
+    target = move(T_COPY, target)
+    with jax.enable_x64(True):
+        p, q = jnp.asarray(source, float), jnp.asarray(target, float)
+        sol = KernelCorrelation(WIDTH, tolerance=1e-6, solver=solver).solve(
+            PointCloud(p, 0 * p, jnp.ones(N, bool)),
+            PointCloud(q, 0 * q, jnp.ones(M, bool)),
+            None,
+        )
+    assert sol.status == Status.CONVERGED
+    best = _best(np.eye(3), source, target)
+    assert np.abs(best - np.eye(3)).max() > 0.1
+    np.testing.assert_allclose(sol.T_target_source, best, atol=1e-5)
+
+
+def test_what_is_no_solver_is_refused():
+    with pytest.raises(TypeError, match="KernelCorrelation: solver: wanted a minim"):
+        KernelCorrelation(solver="BFGS")

@@ -165,7 +165,7 @@ class PoseGraphLM(AbstractAverager):
     def _problem(self, graph: PoseGraph) -> Problem:
         error, precision = self.error, self.error.precision(graph)
         if self.kernel is None:
-            return Problem(graph, error, precision, lambda s: s, jnp.ones_like)
+            return Problem(graph, error, precision, jnp.asarray, jnp.ones_like)
         width = jnp.asarray(self.kernel_width)
         return robust_problem(graph, error, precision, self.kernel, width)
 

@@ -1,28 +1,24 @@
 """Least squares over a graph by a solver of optimistix.
 
 The solver works on one tangent space for all poses, T_world_i <- exp(x_i) T_world_i,
-around those that it starts from. It is started anew around what it found, until that
-changes nothing: so poses stay on the group, and none is far from the middle of its
-tangent space.
+around those that it starts from.
 """
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.loop import AbstractIteration, iterate
-from jaxreg._core.solver import Solver
+from jaxreg._core.loop import iterate
+from jaxreg._core.restarts import MAX_STARTS, AbstractRestarts
+from jaxreg._core.solver import Lowered, Solver
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.steps.iterate import nearby_rotation
-from jaxreg.averaging.steps.levenberg_marquardt import ROUNDING, Problem
+from jaxreg.averaging.steps.levenberg_marquardt import Problem
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import product
 from jaxreg.linear.small import root_semidefinite
-
-
-# Of more starts than so many each would have turned poses by another large angle.
-_STARTS = 5
 
 
 class Minimum(NamedTuple):
@@ -51,60 +47,26 @@ def minimise_by(
     """
     limit = jnp.maximum(tolerance, 4 * jnp.finfo(T_start.dtype).eps)
     charts = _Charts(solver, problem, _whitening(problem), limit, max_steps)
-    ended = iterate(charts, charts.init(T_start), max_steps=_STARTS)
+    ended = iterate(charts, charts.init(T_start), max_steps=MAX_STARTS)
     return Minimum(ended.state.T, ended.converged, ended.state.taken)
 
 
-class _State(NamedTuple):
-    T: Array
-    cost: Array
-    better: Array  # whether the last start led to no higher cost
-    still: Array  # whether it changed nothing, by the solver's and our tolerances
-    num_steps: Array  # starts
-    taken: Array  # steps of the solver
-
-
-class _Charts(AbstractIteration[Array, _State]):
+class _Charts(AbstractRestarts):
     solver: Solver
     problem: Problem
     whitening: Float[Array, "e m m"]
     limit: Scalar
     max_steps: int
 
-    def init(self, start: Array) -> _State:
-        none, no = jnp.asarray(0, jnp.int32), jnp.asarray(False)
-        return _State(start, self.problem.cost(start), ~no, no, none, none)
+    def cost(self, T: Array) -> Array:
+        return self.problem.cost(T)
 
-    def terminate(self, state: _State) -> Bool[Array, ""]:
-        return state.still
-
-    def fail(self, state: _State) -> Bool[Array, ""]:
-        return ~state.better
-
-    def step(self, state: _State) -> _State:
-        """One start of the solver; its poses are kept if the cost does not rise."""
-        s = state
+    def lowered(self, T: Array) -> tuple[Array, Lowered]:
         k = lie.tangent_dim(self.problem.graph.dim)
-
-        def rows(x: Array) -> Array:
-            return self._rows(s.T, x)
-
-        def energy(x: Array) -> Array:
-            return jnp.sum(rows(x) ** 2) / 2
-
-        zero = jnp.zeros(((len(s.T) - 1) * k,), s.T.dtype)
+        zero = jnp.zeros(((len(T) - 1) * k,), T.dtype)
+        energy, rows = (eqx.Partial(f, T) for f in (self._energy, self._rows))
         found = self.solver.lower(energy, rows, zero, self.max_steps)
-        T = nearby_rotation(self._moved(s.T, found.x))
-        cost = self.problem.cost(T)
-        better = cost <= s.cost * (1 + ROUNDING * jnp.finfo(cost.dtype).eps)
-        return _State(
-            T=jnp.where(better, T, s.T),
-            cost=jnp.where(better, cost, s.cost),
-            better=better,
-            still=found.converged & better & (s.cost - cost <= self.limit * s.cost),
-            num_steps=s.num_steps + 1,
-            taken=s.taken + found.num_steps,
-        )
+        return nearby_rotation(self._moved(T, found.x)), found
 
     def _moved(self, T: Array, x: Array) -> Array:
         """The poses at tangents of all but pose 0; those that no edge holds stay."""
@@ -123,6 +85,9 @@ class _Charts(AbstractIteration[Array, _State]):
         # Columns of zeros have no factors.
         free = jnp.where(self._held, 0, x.reshape(len(T) - 1, -1))
         return jnp.concatenate([white.ravel(), free.ravel()])
+
+    def _energy(self, T: Array, x: Array) -> Array:
+        return jnp.sum(self._rows(T, x) ** 2) / 2
 
     @property
     def _held(self) -> Bool[Array, "u 1"]:

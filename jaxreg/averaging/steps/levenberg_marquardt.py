@@ -13,12 +13,14 @@ without one a step on sphere2500 had not converged after 2,000 rounds (12 s; her
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.loop import AbstractIteration, iterate
+from jaxreg._core.restarts import ROUNDING
 from jaxreg._core.solver import LinearSolver
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.measures import length_scale, weighted_mean
@@ -40,8 +42,6 @@ _STALE, _MOVED = 2, 0.3
 # Damping after the first refused step, and the least. There is none before: even 1e-9
 # of the diagonal holds back the bending of a long chain, so that steps converge slowly.
 _DAMPED = 1e-6
-# A sum of the costs of edges is known to so many units of rounding.
-ROUNDING = 8
 
 
 class Problem(NamedTuple):
@@ -98,9 +98,17 @@ def robust_problem(
         graph,
         error,
         precision,
-        lambda s: 2 * kernel.rho(s, width),
-        lambda s: kernel.weight(s, width),
+        eqx.Partial(_loss, kernel, width),
+        eqx.Partial(_trust, kernel, width),
     )
+
+
+def _loss(kernel: AbstractKernel, width: Array, square: Array) -> Array:
+    return 2 * kernel.rho(square, width)
+
+
+def _trust(kernel: AbstractKernel, width: Array, square: Array) -> Array:
+    return kernel.weight(square, width)
 
 
 class Minimum(NamedTuple):

@@ -3,6 +3,7 @@
 import abc
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -43,6 +44,16 @@ def turn_and_shift(T_target_source: Motion, tangent: Float[Array, " k"]) -> Moti
         full_matmul(turn, lie.rotation(T_target_source)),
         lie.translation(T_target_source) + tangent[:d],
     )
+
+
+def tangent_slopes(tangent: Float[Array, " k"]) -> Float[Array, "k k"]:
+    """How `turn_and_shift` by a tangent follows it, as a tangent from where it ends."""
+    d = 2 if len(tangent) == 3 else 3
+    w = tangent[d:]
+    R, dR = lie.rotation_exp(w), jax.jacfwd(lie.rotation_exp)(w)
+    spin = jnp.sum(dR[:, None] * R[None, :, :, None], axis=2)
+    rows = [spin[1, 0]] if d == 2 else [spin[2, 1], spin[0, 2], spin[1, 0]]
+    return jnp.eye(len(tangent), dtype=w.dtype).at[d:, d:].set(jnp.stack(rows))
 
 
 def decoupled_error(

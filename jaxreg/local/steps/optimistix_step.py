@@ -4,7 +4,6 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -13,10 +12,14 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_positive
 from jaxreg._core.solver import Solver
 from jaxreg._core.typing import Motion
-from jaxreg.geometry import lie
 from jaxreg.linear.balance import AbstractBalance, balanced, by_slopes
 from jaxreg.linear.condensed import AbstractSquares, condensed
-from jaxreg.local.steps.base import AbstractStep, turn_and_shift
+from jaxreg.local.steps.base import (
+    AbstractStep,
+    full_matmul,
+    tangent_slopes,
+    turn_and_shift,
+)
 from jaxreg.local.steps.scaling import Scaled, gyration_radius
 from jaxreg.matching.problem import Match, moved
 from jaxreg.matching.residuals import AbstractResidual
@@ -71,7 +74,7 @@ class OptimistixStep(AbstractStep):
         held: Any = lax.stop_gradient(energy)
         zero = jnp.zeros_like(energy.unit)
         found = self.solver.lower(
-            held.value, partial(condensed, held), zero, self.max_steps
+            held.value, eqx.Partial(condensed, held), zero, self.max_steps
         )
         # Not where either is NaN.
         falls = held.value(found.x) <= held.value(zero)
@@ -124,14 +127,9 @@ class _Held(AbstractSquares):
     ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
         """Those of the moved match, which are by tangents from where it is."""
         H, b = self.residual.normal_equations(self._moved(x), self.weight)
-        d = len(self.T) - 1
-        turn = _left_jacobian(self.unit[d:] * x[d:])
-        shift = jnp.eye(d, dtype=x.dtype)
-        J = jax.scipy.linalg.block_diag(shift, turn) * self.unit
+        J = tangent_slopes(self.unit * x) * self.unit
         b = self.scale * jnp.sum(J * b[:, None], axis=0) - self.damping * x
-        H = self.scale * jnp.matmul(
-            J.T, jnp.matmul(H, J, precision="highest"), precision="highest"
-        )
+        H = self.scale * full_matmul(J.T, full_matmul(H, J))
         return H + self.damping * jnp.eye(len(x), dtype=x.dtype), b
 
     def _moved(self, x: Float[Array, " k"]) -> Match:
@@ -160,12 +158,3 @@ class _Minimum(AbstractBalance):
     def solve(self, x: Float[Array, " k"], b: Float[Array, " k"]) -> Float[Array, " k"]:
         """By the slopes of the pulls."""
         return by_slopes(self, x, b)
-
-
-def _left_jacobian(w: Float[Array, " r"]) -> Float[Array, "r r"]:
-    """The turn from exp(w) to exp(w + dw) by dw."""
-    R, dR = lie.rotation_exp(w), jax.jacfwd(lie.rotation_exp)(w)
-    spin = jnp.sum(dR[:, None] * R[None, :, :, None], axis=2)
-    if len(w) == 1:
-        return spin[1, 0][None]
-    return jnp.stack([spin[2, 1], spin[0, 2], spin[1, 0]])
