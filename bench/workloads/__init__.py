@@ -215,6 +215,16 @@ WORKLOADS = {
         "far a derivative is off what it must be.",
         double=True,
     ),
+    "solvers": Workload(
+        "Our steps and other solvers",
+        "ICP, kernel correlation and a pose graph by our own steps, by solvers of "
+        "optimistix in their place, and by those of lineax within them; from the same "
+        "starts, float64 for the graph. `off`: the largest entry by which poses differ "
+        "from the minimum. `steps` are ours, or evaluations of the solver; of ICP "
+        "matches.",
+        double=True,
+        quick=False,
+    ),
     "compile_times": Workload(
         "Compile times",
         "First calls after caches were emptied: tracing, compiling and one run, of "

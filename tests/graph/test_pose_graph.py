@@ -1,3 +1,4 @@
+import chex
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -63,7 +64,7 @@ def test_bad_values_name_the_edge_unless_masked(name, value, message):
         PoseGraph.from_edges(**kwargs, num_poses=3)
     mask = np.array([True, True, False, True])
     graph = PoseGraph.from_edges(**kwargs, num_poses=3, mask=mask)
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(graph))
+    chex.assert_tree_all_finite(graph)
     assert graph.weight[2] == 0
 
 

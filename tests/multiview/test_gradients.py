@@ -1,5 +1,6 @@
 """Derivatives of the poses of many scans by a calibration of their sensor."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,4 +92,4 @@ def test_slopes_are_finite_where_scans_say_little(scans, sloped, spoiled):
     (value, status), slopes = sloped(points, mask=mask)
     assert np.isfinite(value)
     assert status != Status.CONVERGED
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))
+    chex.assert_tree_all_finite(slopes)

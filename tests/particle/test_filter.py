@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+import chex
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -253,7 +254,7 @@ def test_energies_that_tell_nothing_leave_uniform_weights(value):
     found = _search(method, pair.problem)
     np.testing.assert_allclose(np.exp(found.particles.log_weight), 1 / P, rtol=1e-5)
     solution = _conclude(pair, found)
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(solution))
+    chex.assert_tree_all_finite(solution)
     if not np.isfinite(value):
         assert int(solution.status) == Status.NON_FINITE
         np.testing.assert_array_equal(solution.T_target_source, np.eye(3))

@@ -36,8 +36,10 @@ class OptimistixStep(AbstractStep):
     solver have no unit. A step that would raise the energy, or is not finite, leaves
     the pose.
 
-    `GaussNewton` takes one step on each match, where a solver takes several and needs
-    an evaluation more to see that it is done.
+    Not the default: `GaussNewton` takes one step on each match, where a solver takes
+    several and needs an evaluation more to see that it is done. For 2,000 points of the
+    Bunny that is 9.9 ms for 8.7, with Gauss-Newton, LM, Dogleg or BFGS, and a first
+    call of 16 to 19 s for 14; matches are as many, and errors the same.
 
     Gradients: those of the minimum of the held energy, by the implicit function
     theorem. Where ICP is at rest they have no influence.

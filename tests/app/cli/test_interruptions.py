@@ -7,9 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import jax
+import chex
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import jaxreg
@@ -143,8 +142,5 @@ def test_an_interrupted_run_keeps_its_pairs_and_goes_on(
     assert main(["multiview", *scans, "--resume", "--order", "sequential"]) == 0
     options = given[0][2]
     assert options["order"] == "sequential"
-    for one, other in zip(
-        jax.tree.leaves(options["previous"]), jax.tree.leaves(found), strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
+    chex.assert_trees_all_equal(options["previous"], found)
     assert not kept.exists()
