@@ -30,7 +30,7 @@ def test_linear_algebra_knows_arrays_alone():
 
 
 def test_what_solves_loads_nothing_that_draws_or_parses():
-    heavy = "{'matplotlib', 'plotly', 'rich', 'tyro', 'jaxreg.app'}"
+    heavy = "{'matplotlib', 'plotly', 'rich', 'tyro', 'optimistix', 'jaxreg.app'}"
     code = (
         "import sys; from jaxreg import *; from jaxreg.io import *; "
         f"sys.exit(str(set(sys.modules) & {heavy} or ''))"

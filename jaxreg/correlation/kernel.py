@@ -167,8 +167,14 @@ class KernelCorrelation(AbstractRegistrar):
             return _Ascended(ended.state.T, ended.converged, ended.state.num_steps)
         # At a maximum a step of that size gains about its square.
         limit = jnp.maximum(tolerance**2, 4 * jnp.finfo(init.dtype).eps)
-        solver = lax.stop_gradient(self.solver)
-        starts = Restarting(solver, source, target, width, limit, self.max_steps)
+        starts = Restarting(
+            solver=lax.stop_gradient(self.solver),
+            source=source,
+            target=target,
+            bandwidth=width,
+            limit=limit,
+            max_steps=self.max_steps,
+        )
         ended = iterate(starts, starts.init(init), max_steps=MAX_STARTS)
         return _Ascended(ended.state.T, ended.converged, ended.state.taken)
 

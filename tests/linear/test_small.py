@@ -111,3 +111,18 @@ def test_a_direction_that_is_free_up_to_rounding_gets_nothing(dtype):
     assert np.mean(found[:, -1] == 0) > 0.8
     left = np.einsum("bij,bj->bi", A, found) - b
     assert np.abs(left).max() < 1e5 * np.finfo(dtype).eps
+
+
+@pytest.mark.parametrize("rank", [6, 4, 0])
+def test_roots_of_normal_equations_have_their_product_and_pull(rank):
+    rng = np.random.default_rng(rank)
+    rows, r = rng.normal(size=(3, rank, 6)), rng.normal(size=(3, rank))
+    A = np.einsum("bri,brj->bij", rows, rows)
+    b = np.einsum("bri,br->bi", rows, r)
+    with jax.enable_x64(True):
+        R, root = map(np.asarray, small.root_semidefinite(jnp.array(A), jnp.array(b)))
+    np.testing.assert_allclose(R.swapaxes(1, 2) @ R, A, atol=1e-10)
+    np.testing.assert_allclose(np.einsum("bij,bi->bj", R, root), b, atol=1e-10)
+    # No more of the sum of squares than the rows had.
+    assert np.all(np.sum(root**2, axis=1) <= np.sum(r**2, axis=1) + 1e-10)
+    assert np.count_nonzero(np.diagonal(R, axis1=1, axis2=2)) == 3 * rank

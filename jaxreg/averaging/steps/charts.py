@@ -46,7 +46,13 @@ def minimise_by(
         tolerance: share of the cost.
     """
     limit = jnp.maximum(tolerance, 4 * jnp.finfo(T_start.dtype).eps)
-    charts = _Charts(solver, problem, _whitening(problem), limit, max_steps)
+    charts = _Charts(
+        solver=solver,
+        problem=problem,
+        whitening=_whitening(problem),
+        limit=limit,
+        max_steps=max_steps,
+    )
     ended = iterate(charts, charts.init(T_start), max_steps=MAX_STARTS)
     return Minimum(ended.state.T, ended.converged, ended.state.taken)
 
