@@ -96,8 +96,7 @@ class FarScans:
     def _motions(self, motions: RelativeMotions, change: Callable) -> RelativeMotions:
         i, j = (self.origin[x] for x in np.asarray(motions.pairs).T)
         T = change(np.asarray(motions.T_i_j), j[:, None], i[:, None])
-        out = eqx.tree_at(lambda m: m.T_i_j, motions, _told(T, change))
-        return jax.tree.map(jnp.asarray, out) if change is pose_moved else out
+        return eqx.tree_at(lambda m: m.T_i_j, motions, T)
 
     def _solution(
         self, solution: ReconstructionSolution, change: Callable

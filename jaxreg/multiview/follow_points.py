@@ -42,7 +42,8 @@ def follow_points(
         held, mask = lax.stop_gradient(target.points), target.mask
         index = exact_index(len(mask)).build(held, mask)
         problem = Problem.of(source, target, index)
-        return at_rest(Rest(optimiser, problem, width, T_i_j))[0]
+        rest = Rest(optimiser=optimiser, problem=problem, width=width, T=T_i_j)
+        return at_rest(rest)[0]
 
     # What one pair needs is computed again on the way back, not kept for all.
     measured = jax.checkpoint(measured)

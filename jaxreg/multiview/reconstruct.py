@@ -86,7 +86,8 @@ def reconstruct(
             them in its world; else all poses are found anew.
         progress: called as `progress(stage, done, total)`; not under `jit`.
         on_pairs: called with the `RelativeMotions` of every few pairs as they are
-            found, in the input's frames and unit; not under `jit`.
+            found, in the input's frames and unit, as NumPy arrays with motions in
+            float64: from these `previous` gets the very bits; not under `jit`.
 
     Returns:
         A `ReconstructionSolution`. Of NumPy arrays of float64 in map coordinates, see
@@ -204,7 +205,7 @@ def _known(
         new = first_pairs(scans.num_scans, order, rng)
         first = np.concatenate([motions.pairs, new[new[:, 1] >= num_old]])
         first = np.unique(first, axis=0)
-    return motions.in_centred_frames(scans), first
+    return motions.heard(scans), first
 
 
 def _checked(order: str) -> Order:

@@ -127,7 +127,7 @@ class Rounds:
 
     def _tell(self, found: RelativeMotions) -> None:
         if self.on_pairs is not None:
-            self.on_pairs(found.in_input_frames(self.scans))
+            self.on_pairs(found.told(self.scans))
 
     def _follow(self) -> None:
         """Neighbours of a sequence, by descents from the motions before.

@@ -23,6 +23,8 @@ _NO_POSE = Status.TOO_FEW_POINTS, Status.NON_FINITE, Status.DIVERGED
 class RelativeMotions(BriefModule):
     """What the search found for pairs of scans, scan j on scan i.
 
+    Of JAX arrays, or of NumPy arrays where motions are kept in float64.
+
     Of each pair up to m modes of the posterior, the best first.
 
     Attributes:
@@ -38,6 +40,16 @@ class RelativeMotions(BriefModule):
     overlap: Float[Array, "*e m"]
     log_evidence: Float[Array, "*e m"]
     inlier_rmse: Float[Array, "*e m"]
+
+    @classmethod
+    def kept(cls, *arrays: np.ndarray) -> "RelativeMotions":
+        """Of NumPy arrays, one for each attribute, as `on_pairs` was told them."""
+        none = jnp.zeros((0, 1))
+        ids = jnp.zeros((0, 2), jnp.int32)
+        blank = cls(ids, jnp.zeros((0, 1, 3, 3)), none, none, none)
+        leaves, structure = jax.tree.flatten(blank)
+        assert len(arrays) == len(leaves)
+        return jax.tree.unflatten(structure, arrays)
 
     @property
     def num_modes(self) -> int:
@@ -110,17 +122,44 @@ class RelativeMotions(BriefModule):
         rmse = scans.radius * self.inlier_rmse
         return RelativeMotions(self.pairs, T_i_j, self.overlap, self.log_evidence, rmse)
 
-    def in_centred_frames(self, scans: PreparedScans) -> "RelativeMotions":
-        """The other way."""
-        T_i_j = scans.to_centred_frames(self.T_i_j, *self._scans())
-        rmse = self.inlier_rmse / scans.radius
-        return RelativeMotions(self.pairs, T_i_j, self.overlap, self.log_evidence, rmse)
+    def told(self, scans: PreparedScans) -> "RelativeMotions":
+        """`in_input_frames` in float64 on the host: `heard` gets the bits back."""
+        T, rmse, radius, here, there = self._on_host(scans)
+        t = radius * T[..., :-1, -1] + there - _turned(T, here)
+        T[..., :-1, -1] = t
+        return self._with(T, radius * rmse)
+
+    def heard(self, scans: PreparedScans) -> "RelativeMotions":
+        """What was `told`, as the search had it."""
+        T, rmse, radius, here, there = self._on_host(scans)
+        T[..., :-1, -1] = (T[..., :-1, -1] + _turned(T, here) - there) / radius
+        found = self._with(T, rmse / radius)
+        dtype = scans.mean.dtype
+        return jax.tree.map(
+            lambda x: jnp.asarray(x, dtype if x.dtype.kind == "f" else jnp.int32), found
+        )
+
+    def _on_host(self, scans: PreparedScans) -> tuple[np.ndarray, ...]:
+        """Motions, residuals, the radius, the centres of scans j and of scans i."""
+        mean, radius = (np.asarray(x, np.float64) for x in (scans.mean, scans.radius))
+        i, j = (mean[x][:, None] for x in np.asarray(self.pairs).T)
+        T, rmse = (np.array(x, np.float64) for x in (self.T_i_j, self.inlier_rmse))
+        return T, rmse, radius, j, i
+
+    def _with(self, T: np.ndarray, rmse: np.ndarray) -> "RelativeMotions":
+        """NumPy arrays; not by the constructor: JAX without x64 has no float64."""
+        held = jax.tree.map(np.asarray, self)
+        return eqx.tree_at(lambda m: (m.T_i_j, m.inlier_rmse), held, (T, rmse))
 
     def _scans(self) -> tuple[Int[Array, "e m"], Int[Array, "e m"]]:
         """Scans i and j of every mode."""
         shape = self.overlap.shape
         i, j = (jnp.broadcast_to(x[:, None], shape) for x in self.pairs.T)
         return i, j
+
+
+def _turned(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return np.sum(T[..., :-1, :-1] * points[..., None, :], axis=-1)
 
 
 @eqx.filter_jit

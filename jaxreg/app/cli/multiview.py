@@ -5,7 +5,6 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 import jaxreg
@@ -134,7 +133,7 @@ def reconstruct_scans(
         order=order,
         viewpoints=eyes,
         positions=positions,
-        previous=None if kept is None else jaxreg.RelativeMotions(*map(_array, kept)),
+        previous=None if kept is None else jaxreg.RelativeMotions.kept(*kept),
         progress=progress,
         on_pairs=None if log is None else lambda m: log.add(_pairs(m)),
     )
@@ -160,11 +159,6 @@ def _check_viewpoint(viewpoint: tuple[float, ...] | None, scans: Scans) -> None:
                 f"{place}: has points at --viewpoint.\n"
                 "Leave out rows that stand for missing returns."
             )
-
-
-def _array(x: np.ndarray) -> Any:
-    """On the device, floats as the centred scans have them."""
-    return jnp.asarray(x, jnp.result_type(float) if x.dtype.kind == "f" else x.dtype)
 
 
 def _pairs(motions: Any) -> Pairs:
