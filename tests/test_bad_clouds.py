@@ -105,3 +105,54 @@ def test_a_guess_beyond_all_numbers_on_the_map_has_a_status():
     lost[0, 3] = 1e38
     sol = jr.register(source, target, jr.ICP(), init=lost)
     assert int(sol.status) == Status.NON_FINITE
+
+
+def _street(seed, num=10_000, ground=0.9):
+    """A street corner: the ground, and walls and posts with the other points."""
+    rng = np.random.default_rng(seed)
+    flat = np.zeros((int(ground * num), 3))
+    flat[:, :2] = rng.uniform(-20, 20, (len(flat), 2))
+    walls = [  # where, how long and which way
+        ((-8, -6), 9, 0.0),
+        ((7, -9), 6, 1.3),
+        ((9, 8), 11, 0.4),
+        ((-6, 10), 4, 2.2),
+        ((2, 3), 0.6, 0.7),
+        ((-3, -1), 0.6, 0.2),
+    ]
+    lengths = np.array([length for _, length, _ in walls])
+    which = rng.choice(len(walls), num - len(flat), p=lengths / lengths.sum())
+    along = rng.uniform(0, lengths[which])
+    way = np.array([angle for *_, angle in walls])[which]
+    foot = np.array([place for place, *_ in walls])[which]
+    up = rng.uniform(0, 3, len(which))
+    tall = np.column_stack(
+        [foot[:, 0] + along * np.cos(way), foot[:, 1] + along * np.sin(way), up]
+    )
+    points = np.concatenate([flat, tall])
+    return points + 0.02 * rng.standard_normal(points.shape)
+
+
+def test_the_ground_with_nine_tenths_of_the_points_does_not_decide():
+    T_true, c, s = np.eye(4), np.cos(0.7), np.sin(0.7)
+    T_true[:3] = [[c, -s, 0, 2.0], [s, c, 0, -1.5], [0, 0, 1, 0.1]]
+    source = move(np.linalg.inv(T_true), _street(1))
+    sol = jr.register(source, _street(2), key=jax.random.key(0))
+    angle, shift = pose_error(sol.T_target_source, T_true)
+    assert int(sol.status) == Status.CONVERGED
+    assert angle < 0.01
+    assert shift < 0.1
+
+
+@pytest.mark.slow
+def test_hundred_thousand_points_on_three_hundred():
+    T_true = motion(5, 3, angle=1.5, shift=0.5)
+    source = move(np.linalg.inv(T_true), blob(100_000, 3, 1).astype(np.float64))
+    target = blob(300, 3, 2)
+    for method in (None, jr.ICP()):
+        init = None if method is None else T_true @ motion(6, 3, angle=0.1, shift=0.02)
+        sol = jr.register(source, target, method, init=init, key=jax.random.key(0))
+        assert int(sol.status) == Status.CONVERGED
+        angle, shift = pose_error(sol.T_target_source, T_true)
+        assert angle < 0.02
+        assert shift < 0.02
