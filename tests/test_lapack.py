@@ -129,6 +129,8 @@ def test_averaging_of_a_batch(name: str):
         return jr.average(graph(T, weight), method, key=KEY).T_world_i
 
     assert independent(jax.vmap(poses), T, weight) == []
+    if AVERAGERS[name].promises["gradients"] == "refused":
+        return
     slope = jax.vmap(jax.grad(lambda T, weight: poses(T, weight).sum()))
     assert independent(slope, T, weight) == []
 

@@ -188,7 +188,9 @@ def test_reconstruction_in_any_transformation():
             found = jax.tree.map(lambda x, lane=lane: x[lane], many)
             promise_same("reconstruct", jr.ReconstructionSolution, found, alone)
         slope = jax.vmap(jax.grad(lambda points: jnp.sum(solve(points)[0])))
-        assert not jax.jit(slope)(problems).any()
+        slopes = np.asarray(jax.jit(slope)(problems))
+        assert np.isfinite(slopes).all()
+        assert slopes.any(axis=(1, 2, 3)).all()
         promise_round_trips(method, alone)
 
 

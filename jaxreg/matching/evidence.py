@@ -20,7 +20,7 @@ numbers of both ways are left,
     near    the share of the points beside that are within one spacing of the plane:
             surfaces that touch by chance part again,
     patch   the logarithm of the share of either cloud that is near, if that is less
-            than 0.3: small patches fit in more wrong places than large ones.
+            than a quarter: small patches fit in more wrong places than large ones.
 
 The logarithm of the odds of a right pose against the best wrong one is taken to be
 linear in them (logistic regression on pairs of scans):
@@ -61,8 +61,9 @@ NO_EVIDENCE = -100.0
 # a right pose are near and 80 % of those of a wrong one.
 _GAIN, _NEAR, _OFFSET = 2.3, 38.0, 34.8
 # A smaller share of either cloud is a patch, and what a factor of e less weighs: wrong
-# answers to the Bunny's scans of an evidence above zero shared 0.22 at most.
-_PATCH, _FALL = 0.3, 2.0
+# answers to the Bunny's scans of an evidence above zero shared 0.22 at most, rooms that
+# are found a quarter.
+_PATCH, _FALL = 0.25, 4.0
 # A gain so small is none: the mixture found nothing on the surface.
 _LEAST_GAIN = 0.05
 # Points of each cloud that are asked where all pairs are compared: 2 ms; twice as many

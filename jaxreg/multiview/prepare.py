@@ -1,5 +1,7 @@
 """Scans made ready for pairs, once each: cleaned, centred, scaled, thinned, indexed."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -154,13 +156,22 @@ def prepare_scans(
     mask: Bool[Array, "v n"],
     viewpoints: Float[Array, "v d"] | None = None,
     positions: ScanPositions | None = None,
+    *,
+    side_by_side: bool = False,
 ) -> PreparedScans:
-    """Prepares all scans, one after another; NaN stands for an unknown viewpoint."""
+    """Prepares all scans, one after another; NaN stands for an unknown viewpoint.
+
+    Side by side their derivatives are right under `vmap`, too: in a loop JAX leaves the
+    rules for them out, and what it takes instead is not a number.
+    """
     points, mask, dropped = clean(points, mask)
     radius = common_radius(points, mask)
-    clouds, tables, exact, mean, spacing = lax.map(
-        lambda scan: prepare_scan(method, scan[0], scan[1], radius), (points, mask)
-    )
+
+    def one(scan: tuple[Array, Array]) -> tuple:
+        return prepare_scan(method, *scan, radius)
+
+    every = jax.vmap(one) if side_by_side else partial(lax.map, one)
+    clouds, tables, exact, mean, spacing = every((points, mask))
     if viewpoints is not None:
         eyes = (viewpoints - mean) / radius
         clouds = lax.map(lambda scan: scan[0].seen_from(scan[1]), (clouds, eyes))

@@ -165,7 +165,7 @@ def _of_all_pairs(
     key: Key,
 ) -> ReconstructionSolution:
     """What can be traced: no pair is chosen by what others told."""
-    prepared = prepare_scans(method, *inputs)
+    prepared = prepare_scans(method, *inputs, side_by_side=True)
     pairs = jnp.asarray(all_pairs(prepared.num_scans))
     method, held = jax.lax.stop_gradient((method, prepared))
     motions = relative_motions(method, held, pairs, key)

@@ -132,6 +132,8 @@ def _widths(
     """Kernel widths of the steps."""
     alone = part_sizes(placement.part) == 1
     spacing = jnp.max(jnp.where(alone, 0, scans.spacing))
+    # Of no pair: under `vmap` also what is not chosen must be finite.
+    spacing = jnp.where(spacing > 0, spacing, 1)
     factors = _EXACT_WIDTHS if exact else _TABLE_WIDTHS
     return spacing * jnp.asarray(factors, spacing.dtype)
 
