@@ -238,6 +238,6 @@ def test_public_files(name, poses, edges, has_vertices):
 def test_what_would_not_be_read_is_not_written(tmp_path):
     graph, _ = random_graph(3)
     negative = eqx.tree_at(lambda g: g.weight, graph, -graph.weight)
-    with pytest.raises(ValueError, match=r"edge 0 .*weight is negative"):
+    with pytest.raises(ValueError, match=r"graph: edge 0 .*weight is negative"):
         write_g2o(tmp_path / "a.g2o", negative)
     assert not list(tmp_path.iterdir())

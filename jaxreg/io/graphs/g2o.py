@@ -135,8 +135,11 @@ def write_g2o(
         InputError: if the folder cannot be written.
     """
     check_graph(graph, "graph")
-    check_weights(graph.weight, graph.edges, graph.mask)
-    check_information(graph.information, graph.edges, graph.mask)
+    try:
+        check_weights(graph.weight, graph.edges, graph.mask)
+        check_information(graph.information, graph.edges, graph.mask)
+    except EdgeError as err:
+        raise ValueError(f"graph: {err}") from None
     d, num = graph.dim, graph.num_poses
     names = as_host_array(np.arange(num) if ids is None else ids, "ids")
     if names.shape != (num,):
