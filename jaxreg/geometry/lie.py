@@ -143,11 +143,19 @@ def rotation_log(R: Float[Array, "*b d d"]) -> Float[Array, "*b r"]:
     return group.from_matrix(R).log()
 
 
-@_behind
 def adjoint(T: Motions) -> Float[Array, "*b k k"]:
     """Ad(T): `T exp(v) inv(T) = exp(Ad(T) v)`."""
-    group = jaxlie.SE2 if T.shape[-1] == 3 else jaxlie.SE3
-    return group.from_matrix(T).adjoint()
+    R, t = rotation(T), translation(T)
+    if T.shape[-1] == 3:
+        shift = jnp.stack([t[..., 1], -t[..., 0]], axis=-1)[..., None]
+        turn = jnp.ones_like(shift[..., :1, :])
+    else:
+        # A product of matrices may be run in reduced precision on accelerators.
+        shift = jnp.sum(_hat(t)[..., None] * R[..., None, :, :], axis=-2)
+        turn = R
+    low = jnp.zeros((*turn.shape[:-1], R.shape[-1]), T.dtype)
+    top = jnp.concatenate([R, shift], axis=-1)
+    return jnp.concatenate([top, jnp.concatenate([low, turn], axis=-1)], axis=-2)
 
 
 def compose(

@@ -91,7 +91,7 @@ def conclude(
         T_modes = _followed(*moving, exact, T_modes, found.sound, enough)
     else:
         T_modes = refusing(T_modes, moving, _UNREFINED)
-    evidence, holds = found.evidence, found.evidence.grip.holds
+    evidence, holds = found.evidence, found.holds
     doubtful = ~holds[0] | _has_rival(found.log_evidence, holds)
     status = _status(found.sound[0], enough, doubtful, pair, finished | refines)
     best, curvature = jax.tree.map(lambda x: x[0], (evidence, curvatures))
@@ -127,6 +127,7 @@ class _Candidates(NamedTuple):
     mass: Float[Array, " q"]
     sound: Bool[Array, " q"]
     evidence: Evidence
+    holds: Bool[Array, " q"]
 
     @property
     def log_evidence(self) -> Float[Array, " q"]:
@@ -176,8 +177,14 @@ def _judged(
     if log_prior is not None:
         told = evidence.log_evidence + jax.vmap(log_prior)(T)
         evidence = dataclasses.replace(evidence, log_evidence=told)
-    sound = sound & ((jnp.arange(len(sound)) < num_modes) | _convincing(evidence))
-    found = _Candidates(T, mass, sound, evidence)
+    # Proposals count that are held, and by more than a patch: particles descend to where
+    # clouds share much, and the evidence was learned there; features find small patches
+    # that fit each other as if they were the same (9 % of two scans of opposite sides
+    # of the sculpture).
+    holds = evidence.grip.holds
+    counts = holds & (evidence.overlap >= _LEAST_SHARED)
+    sound = sound & ((jnp.arange(len(sound)) < num_modes) | counts)
+    found = _Candidates(T, mass, sound, evidence, holds)
     order = jnp.arange(num_modes)
     if refine_steps:
         order = jnp.argsort(-found.log_evidence)[:num_modes]
@@ -233,16 +240,6 @@ def _followed(
     first = jnp.where(sound[0], first, T[0])
     others = followed(optimiser, problem, width, T[1:], sound[1:])
     return jnp.concatenate([first[None], others])
-
-
-def _convincing(evidence: Evidence) -> Bool[Array, " q"]:
-    """Which proposals count: those that are held, and by more than a patch.
-
-    Particles descend to where clouds share much; the evidence was learned there.
-    Features find small patches that fit each other as if they were the same: 9 % of
-    two scans of opposite sides of the sculpture.
-    """
-    return evidence.grip.holds & (evidence.overlap >= _LEAST_SHARED)
 
 
 def _has_rival(
