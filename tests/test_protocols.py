@@ -172,7 +172,7 @@ def test_priors(prior, num):
 
 
 def test_reconstruction_in_any_transformation():
-    method = REGISTRARS["ParticleFilter"].make(2)
+    method = REGISTRARS["ICP"].make(2)
     promise_traced_numbers(method)
 
     def solve(points):
