@@ -37,6 +37,7 @@ from .matching import AbstractResidual as AbstractResidual
 from .matching import PlaneToPlane as PlaneToPlane
 from .matching import PointToPlane as PointToPlane
 from .matching import PointToPoint as PointToPoint
+from .matching import SoftMatches as SoftMatches
 from .matching import Symmetric as Symmetric
 from .multiview import ReconstructionSolution as ReconstructionSolution
 from .multiview import RelativeMotions as RelativeMotions

@@ -57,7 +57,7 @@ def test_every_kind_of_part_is_met():
     wanted = {contract.__name__ for _, _, contract in PARTS}
     parts = "Kernel Residual Step Prior Dynamics Resampler Energy Adjoint Averager Rows"
     ours = {f"Abstract{name}" for name in [*parts.split(), "EdgeError"]}
-    assert wanted == {*ours, "Solver", "LinearSolver"}
+    assert wanted == {*ours, "Solver", "LinearSolver", "SoftMatches"}
 
 
 @pytest.mark.parametrize(("kind", "field", "contract"), PARTS)

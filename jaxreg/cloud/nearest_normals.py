@@ -25,6 +25,7 @@ def normals_from_neighbours(
     count: Float[Array, " n"],
     spread: Float[Array, "n d d"],
     num_neighbours: int,
+    fading: bool = False,
 ) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
     """Unit normals of either sign of the valid places, and the spacing around them.
 
@@ -32,7 +33,8 @@ def normals_from_neighbours(
 
     A place stands for `count` points with mean there and summed outer products of
     offsets `spread`; a normal is the direction of least spread of all the points of
-    the nearest places, itself among them.
+    the nearest places, itself among them. With `fading` the weight of a place falls to
+    zero with its squared distance: which ones are near then changes no normal at once.
 
     Gradients: of the normals by places and spread, which places are near is held; the
     spacing is cut.
@@ -43,8 +45,13 @@ def normals_from_neighbours(
     found = BruteForce.build(frozen, mask).query(frozen, k)
     row, valid = found.index.T, found.valid.T
     weight = jnp.where(valid, count[row], 0)
-    total = jnp.maximum(jnp.sum(weight, axis=0), 1)
     delta = [places[:, i][row] - places[:, i] for i in range(d)]
+    if fading:
+        sq = sum(x * x for x in delta)
+        last = jnp.max(jnp.where(valid, sq, 0), axis=0)
+        weight = weight * (1 - sq / jnp.where(last > 0, last, 1))
+    total = jnp.sum(weight, axis=0)
+    total = jnp.where(total > 0, total, 1)
     mean = [jnp.sum(weight * x, axis=0) / total for x in delta]
     moments = [[total] * d for _ in range(d)]
     for i in range(d):

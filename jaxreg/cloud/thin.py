@@ -22,7 +22,11 @@ _MANY = 4
 
 
 def thin(
-    points: Points, mask: Mask, capacity: int, num_neighbours: int | None = None
+    points: Points,
+    mask: Mask,
+    capacity: int,
+    num_neighbours: int | None = None,
+    fading: bool = False,
 ) -> PointCloud:
     """At most `capacity` points in spatial order, with normals from all the points.
 
@@ -38,6 +42,8 @@ def thin(
             masked.
         num_neighbours: static; normals are estimated from the points around that many
             nearest places, or by `estimate_normals`' cells, ten times faster.
+        fading: static; the farther of these count less, and the farthest nothing, so
+            that normals are continuous in the points.
 
     Gradients: by the points, of the means and, after `followed`, the normals; which
     cell a point is in, and so which points are merged, is held. The spacing around each
@@ -68,7 +74,7 @@ def thin(
             offset[:, :, None] * offset[:, None, :], cell, len(valid)
         )
         normals, spacing = normals_from_neighbours(
-            places, valid, count, spread, num_neighbours
+            places, valid, count, spread, num_neighbours, fading
         )
     points = jnp.where(valid[:, None], places + low, 0)
     return PointCloud(points, normals, valid, spacing=spacing, window=window)

@@ -157,7 +157,7 @@ class Descending(AbstractIteration[tuple[Motion, Scalar], Descent]):
             num = jnp.where(state.fine, n, -(-n // stride))
         if self.limits.with_scale:
             part = part.scaled(state.scale)
-        return match(part, state.T, num=num, coarse=~state.fine)
+        return match(part, state.T, num=num, coarse=~state.fine, width=state.width)
 
 
 def _either(fine: Array, problem: Problem, coarse: Problem) -> Problem:

@@ -6,6 +6,8 @@ Segal et al. 2009 (GICP) is `PlaneToPlane` with `GaussNewton`; Fitzgibbon 2003 (
 is `PointToPoint` with `Huber` and `LevenbergMarquardt`.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
@@ -41,6 +43,7 @@ from jaxreg.local.steps import AbstractStep, GaussNewton
 from jaxreg.matching.evidence import LIKELY, Evidence, Witness
 from jaxreg.matching.problem import Match, Problem, match
 from jaxreg.matching.residuals import AbstractResidual, PlaneToPlane
+from jaxreg.matching.soft import SoftMatches
 from jaxreg.neighbours import (
     AbstractIndex,
     IndexBuilder,
@@ -83,6 +86,10 @@ class ICP(AbstractRegistrar):
             `T_target_source` is a rotation times that factor, without a guess it
             starts from the ratio of the clouds' radii, and H, b and the covariance
             are those of the pose at that factor.
+        soft: means over the surroundings of the closest points in place of these, and
+            normals and spacing that change as smoothly: for derivatives that hold for
+            more than the least change. Ten times slower; `max_points` should not be
+            less than there are. None: the closest points.
         adjoint: `ImplicitAdjoint()`, or `RecursiveCheckpointAdjoint()` for few steps
             taken on purpose.
 
@@ -99,11 +106,13 @@ class ICP(AbstractRegistrar):
     spacing, frames and kernel width follow the points. Held are the correspondences,
     which points are merged and which cells normals are taken from: of two clouds of 300
     points with a noise of a quarter of their spacing, differences of 1e-7 agree to
-    1e-6, but those of 1e-4 and more exchange matches, and differ several times over. A
-    width above `width_end` has the slope of the residual that it was taken from: exact
-    if the last step took it, but not if an earlier one did. Directions that are free do
-    not move, and nothing flows to `init` but where it is returned. With
-    `RecursiveCheckpointAdjoint()` through the steps, also to `init`, in reverse mode.
+    1e-6, but those of 1e-4 and more exchange matches, and differ several times over.
+    With `soft=SoftMatches()` those of 1e-3 agree within 4 % there, and within 5 % on
+    scans of two lidars and an object, 4,000 points of each. A width above `width_end`
+    has the slope of the residual that it was taken from: exact if the last step took
+    it, but not if an earlier one did. Directions that are free do not move, and nothing
+    flows to `init` but where it is returned. With `RecursiveCheckpointAdjoint()`
+    through the steps, also to `init`, in reverse mode.
     """
 
     # Discs ten times thicker than GICP's reach the solution from farther away, with
@@ -118,6 +127,7 @@ class ICP(AbstractRegistrar):
     width_end: Array | float = traced(1.0)
     tolerance: Array | float = traced(1e-4)
     with_scale: bool = eqx.field(default=False, static=True)
+    soft: SoftMatches | None = None
     adjoint: AbstractAdjoint = ImplicitAdjoint()
 
     def __check_init__(self) -> None:
@@ -128,6 +138,7 @@ class ICP(AbstractRegistrar):
             kernel=AbstractKernel,
             step=AbstractStep,
             adjoint=AbstractAdjoint,
+            soft=SoftMatches | None,
         )
         check_index(self)
         check_counts(self, max_steps=1, max_points=1)
@@ -143,7 +154,10 @@ class ICP(AbstractRegistrar):
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
         """Without noise that fills the box, thinned, in spatial order, with normals."""
-        return thin(points, without_noise(points, mask), self.max_points)
+        mask = without_noise(points, mask)
+        if self.soft is None:
+            return thin(points, mask, self.max_points)
+        return thin(points, mask, self.max_points, self.soft.num, fading=True)
 
     @eqx.filter_jit
     def iteration(
@@ -197,7 +211,8 @@ class ICP(AbstractRegistrar):
         if isinstance(self.adjoint, ImplicitAdjoint):
             T, scale = _settled(optimiser, problem, limits, end)
 
-        found = match(problem.scaled(end.scale), end.T_matched, end.row)
+        scaled, width = problem.scaled(end.scale), end.width
+        found = match(scaled, end.T_matched, end.row, width=width)
         found = found.within(limits.farthest)
         frozen, frozen_found = lax.stop_gradient((problem, found))
         weight = lax.stop_gradient(optimiser.weights(frozen_found, end.width))
@@ -237,6 +252,10 @@ class ICP(AbstractRegistrar):
         spacing = median_spacing(target.points, target.mask)
         index = lax.stop_gradient(self._indexed(target, spacing))
         problem = Problem.of(source, target, index, frames)
+        if self.soft is not None:
+            soft = self.soft.among(*lax.stop_gradient((target.points, target.mask)))
+            problem = dataclasses.replace(problem, soft=soft)
+            spacing = soft.spacing(target.points, target.mask)
         optimiser = LocalOptimiser(self.residual, self.kernel, self.step)
         return Descending(optimiser, problem, self._limits(spacing)), spacing
 
@@ -279,7 +298,8 @@ def _settled(
 ) -> tuple[Motion, Scalar]:
     """The pose and scale at the end, with their derivatives."""
     end = lax.stop_gradient(end)
-    found = match(problem.scaled(end.scale), end.T, end.row).within(limits.farthest)
+    scaled = problem.scaled(end.scale)
+    found = match(scaled, end.T, end.row, width=end.width).within(limits.farthest)
     wide = optimiser.kernel.width_of(found.sq_residual, found.mask)
     follows = (end.width > limits.floor) & (wide > 0)
     share = jnp.where(follows, end.width / jnp.where(follows, wide, 1), 0)

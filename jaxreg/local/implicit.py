@@ -89,7 +89,7 @@ class Rest(AbstractRest):
         """The same matches at a tangent from the pose, and their weights there."""
         T, scale = _moved(self.T, self.scale, x)
         problem = self.problem if scale is None else self.problem.scaled(scale)
-        found = match(problem, T, self.row)
+        found = match(problem, T, self.row, width=self.width)
         if self.farthest is not None:
             found = found.within(self.farthest)
         return found, self.optimiser.weights(found, self._width(found))

@@ -14,3 +14,4 @@ from jaxreg.matching.residuals import PointToPlane as PointToPlane
 from jaxreg.matching.residuals import PointToPoint as PointToPoint
 from jaxreg.matching.residuals import Symmetric as Symmetric
 from jaxreg.matching.slippage import Grip as Grip
+from jaxreg.matching.soft import SoftMatches as SoftMatches

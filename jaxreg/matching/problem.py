@@ -5,6 +5,8 @@ The source is centred at its own centroid, so that rotation and translation deco
 (PF paper, section 3.1); see `jaxreg.cloud.frames` for the frames around it.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -12,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import Frames, PointCloud, RangeImage
 from jaxreg.geometry import lie
+from jaxreg.matching.soft import Surroundings
 from jaxreg.neighbours.base import AbstractIndex
 
 
@@ -26,6 +29,7 @@ class Problem(eqx.Module):
         index: closest points among the target.
         seen: what the target's scanner saw, where its viewpoint is known.
         frames: those of the input, where they are known.
+        soft: what surrounds the target points, if matches are means over these.
     """
 
     source: Float[Array, "d n"]
@@ -35,6 +39,7 @@ class Problem(eqx.Module):
     index: AbstractIndex
     seen: RangeImage | None = None
     frames: Frames | None = None
+    soft: Surroundings | None = None
 
     @classmethod
     def of(
@@ -57,14 +62,11 @@ class Problem(eqx.Module):
 
     def of_rows(self, rows: Int[Array, " r"] | slice) -> "Problem":
         """The problem of some of the source points."""
-        return Problem(
-            self.source[:, rows],
-            self.source_normals[:, rows],
-            self.source_mask[rows],
-            self.target,
-            self.index,
-            self.seen,
-            self.frames,
+        return dataclasses.replace(
+            self,
+            source=self.source[:, rows],
+            source_normals=self.source_normals[:, rows],
+            source_mask=self.source_mask[rows],
         )
 
     def every(self, step: int) -> "Problem":
@@ -78,14 +80,11 @@ class Problem(eqx.Module):
     def padded(self, num: int) -> "Problem":
         """The problem with masked rows behind the source, `num` in all."""
         pad = num - self.source_mask.shape[0]
-        return Problem(
-            jnp.pad(self.source, ((0, 0), (0, pad))),
-            jnp.pad(self.source_normals, ((0, 0), (0, pad))),
-            jnp.pad(self.source_mask, (0, pad)),
-            self.target,
-            self.index,
-            self.seen,
-            self.frames,
+        return dataclasses.replace(
+            self,
+            source=jnp.pad(self.source, ((0, 0), (0, pad))),
+            source_normals=jnp.pad(self.source_normals, ((0, 0), (0, pad))),
+            source_mask=jnp.pad(self.source_mask, (0, pad)),
         )
 
 
@@ -153,12 +152,14 @@ def match(
     row: Int[Array, " n"] | None = None,
     num: Int[Array, ""] | None = None,
     coarse: Bool[Array, ""] | None = None,
+    width: Scalar | None = None,
 ) -> Match:
     """Closest target points of the source under a pose (PF paper, Eq. 2).
 
     Where `row` is given, those rows of the target are taken instead of the closest;
     with `num`, matches of source points beyond the first `num` are arbitrary; where
-    `coarse` is True, an index may take a near point for the closest.
+    `coarse` is True, an index may take a near point for the closest. With the `width`
+    of the kernel the matches of a problem that has them soft are means.
     """
     d = problem.source.shape[0]
     R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
@@ -166,7 +167,10 @@ def match(
     moved = rotated + t[:, None]
     if row is None:
         row = problem.index.lookup(moved, num, coarse)
-    found = problem.target[row]
+    if problem.soft is None or width is None:
+        found = problem.target[row]
+    else:
+        found = problem.soft.blended(problem.target, moved, row, width)
     normal = jnp.stack([found[:, d + k] for k in range(d)])
     residual = jnp.stack([found[:, k] for k in range(d)]) - moved
     source_normal = rotate(R, problem.source_normals)
