@@ -128,8 +128,10 @@ KERNELS = [
 RESAMPLERS = [
     particle.Multinomial(),
     particle.Residual(1.0),
+    particle.Soft(0.5, threshold=0.7),
     particle.Stratified(),
     particle.Systematic(0.3),
+    particle.Transport(),
 ]
 #: Steps, and the residual that they are tried with.
 STEPS: list[tuple[jr.AbstractStep, jr.AbstractResidual]] = [

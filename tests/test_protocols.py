@@ -147,7 +147,8 @@ def test_kernels(kernel):
 
 @pytest.mark.parametrize("resampler", RESAMPLERS, ids=lambda r: type(r).__name__)
 def test_resamplers(resampler):
-    check_resampler(resampler)
+    with jax.debug_nans(False):  # rows that are not in use hold them
+        check_resampler(resampler)
 
 
 @pytest.mark.parametrize(("step", "residual"), STEPS, ids=repr)

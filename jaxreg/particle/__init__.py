@@ -20,11 +20,14 @@ from jaxreg.particle.priors import GaussianPrior as GaussianPrior
 from jaxreg.particle.priors import GivenParticles as GivenParticles
 from jaxreg.particle.priors import PartialPose as PartialPose
 from jaxreg.particle.priors import UniformPrior as UniformPrior
+from jaxreg.particle.resamplers import AbstractHardResampler as AbstractHardResampler
 from jaxreg.particle.resamplers import AbstractResampler as AbstractResampler
 from jaxreg.particle.resamplers import Multinomial as Multinomial
 from jaxreg.particle.resamplers import Residual as Residual
+from jaxreg.particle.resamplers import Soft as Soft
 from jaxreg.particle.resamplers import Stratified as Stratified
 from jaxreg.particle.resamplers import Systematic as Systematic
+from jaxreg.particle.resamplers import Transport as Transport
 from jaxreg.particle.state import ParticleInfo as ParticleInfo
 from jaxreg.particle.state import Particles as Particles
 from jaxreg.particle.state import ParticleState as ParticleState

@@ -152,7 +152,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
 
     def problem(self, pair: tuple[Array, ...], key: Key) -> Problem:
         """What `search` works on, of a source, a target and their masks; traced."""
-        ready = prepare_pair(self, lax.stop_gradient(pair))
+        ready = prepare_pair(self, pair)
         index = self._indexes(ready.source, ready.target)[1]
         problem = Problem.of(ready.source, ready.target, index, ready.frames)
         return _some_points(check_key(key), problem, self.num_points)

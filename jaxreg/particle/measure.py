@@ -44,6 +44,7 @@ def measure(
     first, last = widths
 
     def one(T: Array) -> tuple[Array, Array, Array]:
+        @jax.checkpoint  # backwards a step is matched again, not remembered
         def step(i: Array, T: Array) -> Array:
             share = i / jnp.maximum(num_steps - 1, 1)
             width = first * (last / first) ** share.astype(T.dtype)

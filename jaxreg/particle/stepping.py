@@ -13,11 +13,13 @@
 `ParticleFilter.search` is this loop, compiled: who steps by hand sees what it does.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from jaxreg._core.arrays import cast_floats
@@ -123,13 +125,12 @@ class Filtering(eqx.Module):
         method, problem = self.method, self.problem
         time, num = state.num_steps + 1, method.num_particles
         key_resample, key_predict = jax.random.split(key)
-        ancestors, log_weight = method.resampler(
+        particles, ancestors = method.resampler(
             key_resample,
-            state.log_weight,
-            jnp.asarray(num),
+            state.particles,
+            num,
             may_keep=(time != 1) | (method.num_prior == num),
         )
-        particles = state.particles.rows(ancestors).weighted(log_weight)
         T_predicted = method.dynamics(key_predict, particles, time)
         width = self.width(time)
         particles = measure(
@@ -160,6 +161,45 @@ class Filtering(eqx.Module):
             state.settled,
         )
         return state, info
+
+    def scan(
+        self, key: Key, init: Motion | None = None
+    ) -> tuple[ParticleState, ParticleInfo]:
+        """All steps to t = `num_times`, none of which ends the filter, by one scan.
+
+        `log_evidence` of the state is the estimate of the marginal likelihood
+        log p(z_0, .., z_t) = sum_t log p(z_t | z_0, .., z_t-1) (Doucet, Johansen 2009,
+        section 4): what settings may be learned by, with the temperature of the
+        likelihoods in mind (see `ParticleInfo.log_evidence`).
+
+        Args:
+            key: as of the search, which takes the same steps where `num_agreeing` and
+                `tolerance` are zero.
+            init: as of `init`.
+
+        Returns:
+            The last state, and what was told of the steps, rows by time; all particles
+            of the prior are drawn, and none is settled.
+
+        Gradients: in forward and reverse mode, by the points, by `init` and by the
+        numbers of the filter and its parts, but for those that choose (`tolerance`,
+        `threshold`): through the steps of the local optimiser with the closest points
+        held, the energies and the learned temperature, to first order. With `Transport`
+        nothing else is left out; with `Soft` which copies are drawn; with the others
+        also the weights before resampling (see `AbstractHardResampler`).
+        """
+        method = dataclasses.replace(self.method, num_agreeing=0)
+        filtering = Filtering(method, self.problem)
+        key_init, key_steps = jax.random.split(key)
+
+        @jax.checkpoint
+        def step(
+            state: ParticleState, time: Int[Array, ""]
+        ) -> tuple[ParticleState, ParticleInfo]:
+            return filtering.step(jax.random.fold_in(key_steps, time), state)
+
+        times = jnp.arange(1, method.num_times + 1)
+        return lax.scan(step, filtering.init(key_init, init), times)
 
     def terminate(self, state: ParticleState) -> Bool[Array, ""]:
         """Whether no particle's motion error exceeds the tolerance."""

@@ -10,6 +10,11 @@ from jaxtyping import Array, Bool, Float
 from jaxreg._core.typing import Scalar
 
 
+# Where an effective sample size differs by such a share from that asked for, or hardly
+# changes with the temperature, none has that size: the temperature is a bound.
+_NEAR, _FLAT = 1e-2, 1e-3
+
+
 def effective_sample_size(log_weight: Float[Array, " p"]) -> Scalar:
     """(sum w)^2 / sum w^2: between 1 and p, whatever the scale of the weights."""
     return jnp.exp(2 * jax.nn.logsumexp(log_weight) - jax.nn.logsumexp(2 * log_weight))
@@ -62,23 +67,48 @@ def likelihood(
     effective sample size, so that there is no schedule to choose, or a larger one where
     the temperature would fall below the `coldest`: poses that the points do not tell
     apart, as those of a symmetric object, stay equally likely.
+
+    Gradients: by the energies, the size and the coldest, of the temperature, too, to
+    first order.
     """
     finite = jnp.isfinite(energy)
-    low = jnp.min(jnp.where(finite, energy, jnp.inf))
-    excess = jnp.where(finite, energy - jnp.where(jnp.isfinite(low), low, 0), jnp.inf)
-    span = jnp.max(jnp.where(finite, excess, 0))
+    known = jnp.any(finite)
+    low = jnp.where(known, jnp.min(jnp.where(finite, energy, jnp.inf)), 0)
+    excess = jnp.where(finite, energy - low, 0)
+    size = jnp.asarray(target_size, energy.dtype)
+    temperature = jnp.maximum(_temperature(excess, finite, size), coldest)
+    best = jnp.where(known, -low / temperature, -jnp.inf)
+    relative = jnp.where(finite, -excess / temperature, -jnp.inf)
+    return Likelihood(jnp.where(known, relative, 0), best)
+
+
+def _temperature(
+    excess: Float[Array, " p"], counts: Bool[Array, " p"], target_size: Scalar
+) -> Scalar:
+    """That at which exp(-excess / temperature) has an effective sample size.
+
+    Gradients: those of the equation that it solves, to first order; where none
+    does, those of the largest excess, by which temperatures are bounded.
+    """
+
+    def size_at(temperature: Array, excess: Array) -> Array:
+        weight = jnp.where(counts, jnp.exp(-excess / temperature), 0)
+        return jnp.sum(weight) ** 2 / jnp.maximum(jnp.sum(weight**2), 1)
+
+    span = jnp.max(excess)
     span = jnp.where(span > 0, span, 1)
+    held, wanted, unit = lax.stop_gradient((excess, target_size, span))
 
     def halve(_: Array, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         cold, hot = bounds
         middle = jnp.sqrt(cold * hot)
-        weight = jnp.exp(-excess / middle)
-        size = jnp.sum(weight) ** 2 / jnp.maximum(jnp.sum(weight**2), 1)
-        small = size < target_size
+        small = size_at(middle, held) < wanted
         return jnp.where(small, middle, cold), jnp.where(small, hot, middle)
 
-    temperature = lax.fori_loop(0, 24, halve, (span * 1e-4, span * 1e3))[1]
-    temperature = jnp.maximum(temperature, coldest)
-    known = jnp.any(finite)
-    best = jnp.where(known, -jnp.where(known, low, 0) / temperature, -jnp.inf)
-    return Likelihood(jnp.where(known, -excess / temperature, 0), best)
+    found = lax.fori_loop(0, 24, halve, (unit * 1e-4, unit * 1e3))[1]
+    size, slope = jax.jvp(lambda T: size_at(T, held), (found,), (jnp.ones_like(found),))
+    near = jnp.abs(size - wanted) < _NEAR * wanted
+    solvable = near & (slope * found > _FLAT * size)
+    # Newton's step from held numbers has the derivative of what it leads to.
+    step = (target_size - size_at(found, excess)) / jnp.where(solvable, slope, 1)
+    return jnp.where(solvable, found + step, found / unit * span)

@@ -13,7 +13,7 @@ from jaxreg._core.arrays import traced
 from jaxreg.local import LocalOptimiser
 from jaxreg.neighbours import IndexOptions
 from jaxreg.particle import (
-    AbstractResampler,
+    AbstractHardResampler,
     GivenParticles,
     NoDynamics,
     ParticleFilter,
@@ -31,7 +31,7 @@ NEAR = TRUTH @ motion(7, D, angle=0.05, shift=1.0)
 STARTS = np.stack([motion(i, D, shift=300.0) for i in range(P - 1)] + [NEAR])
 
 
-class _Shifted(AbstractResampler):
+class _Shifted(AbstractHardResampler):
     """The ancestor of row i is row 5 i + 3."""
 
     threshold: Array | float = traced(1.0)

@@ -12,7 +12,7 @@ from jaxreg import robust
 from jaxreg.averaging.base import solution
 from jaxreg.local import turn_and_shift
 from jaxreg.neighbours import BruteForce
-from jaxreg.particle import UniformPrior
+from jaxreg.particle import AbstractHardResampler, UniformPrior
 from jaxreg.robust import by_lower_third
 from jaxreg.testing import (
     check_averager,
@@ -167,7 +167,7 @@ def test_indexes(twist, sentence):
         check_index(build)
 
 
-class Resampler(jr.AbstractResampler):
+class Resampler(AbstractHardResampler):
     """The heaviest particle alone."""
 
     threshold: jax.Array | float = eqx.field(default=0.5, converter=jnp.asarray)

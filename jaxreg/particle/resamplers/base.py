@@ -1,20 +1,22 @@
-"""The contract of resamplers, and the rule of when to resample."""
+"""The contracts of resamplers, and the rule of when to resample."""
 
 import abc
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import check_not_negative
 from jaxreg._core.typing import Key
+from jaxreg.particle.state import Particles
 from jaxreg.particle.weights import effective_sample_size
 
 
 class AbstractResampler(BriefModule):
-    """Replaces weighted particles by copies (PF paper, section 3.4).
+    """Replaces weighted particles by others that weigh about the same.
 
     Attributes:
         threshold: particles are resampled only where their effective sample size,
@@ -34,6 +36,55 @@ class AbstractResampler(BriefModule):
         check_not_negative(self, "threshold")
 
     @abc.abstractmethod
+    def replace(
+        self, key: Key, particles: Particles, num: int
+    ) -> tuple[Particles, Int[Array, " p"]]:
+        """`num` particles in the first rows, and the row that each is most of.
+
+        Weighted means stay as they are in expectation, or nearly. Energies of the
+        result mean nothing, nor do rows beyond `num`, which have no weight.
+
+        Args:
+            key: randomness.
+            particles: with normalised weights, -inf for rows that are not in use.
+            num: how many there shall be, at most p.
+        """
+
+    def __call__(
+        self,
+        key: Key,
+        particles: Particles,
+        num: int,
+        may_keep: Bool[Array, ""] | bool,
+    ) -> tuple[Particles, Int[Array, " p"]]:
+        """`replace`, where the threshold asks for it; else the particles and rows.
+
+        Args:
+            key: randomness.
+            particles: with normalised weights, -inf for rows that are not in use.
+            num: how many there shall be, in the first rows.
+            may_keep: False where resampling must take place, as their number changes.
+        """
+        others, rows = self.replace(key, particles, num)
+        size = effective_sample_size(particles.log_weight)
+        keep = may_keep & (self.threshold < 1) & (size >= self.threshold * num)
+        out = jax.tree.map(lambda a, b: jnp.where(keep, a, b), particles, others)
+        return out, jnp.where(keep, jnp.arange(len(rows)), rows).astype(jnp.int32)
+
+
+class AbstractHardResampler(AbstractResampler):
+    """Copies particles, which weigh the same after (PF paper, section 3.4).
+
+    Gradients: poses have those of the rows that they are copies of. How often a
+    particle is copied jumps with its weight, which nothing can follow: what depends on
+    the weights before is left out, so that gradients through several times are biased.
+    `Soft` and `Transport` are there for these.
+
+    Attributes:
+        threshold: see `AbstractResampler`.
+    """
+
+    @abc.abstractmethod
     def draw(
         self, key: Key, weight: Float[Array, " p"], num: Int[Array, ""] | int
     ) -> Int[Array, " p"]:
@@ -45,32 +96,26 @@ class AbstractResampler(BriefModule):
             num: how many to draw, at most p; rows of the result beyond it mean nothing.
         """
 
-    def __call__(
-        self,
-        key: Key,
-        log_weight: Float[Array, " p"],
-        num: Int[Array, ""] | int,
-        may_keep: Bool[Array, ""] | bool,
-    ) -> tuple[Int[Array, " p"], Float[Array, " p"]]:
-        """Ancestors of `num` particles and the logarithms of their weights.
-
-        Args:
-            key: randomness.
-            log_weight: `(p,)` normalised, -inf for rows that are not in use.
-            num: how many particles there shall be, in the first rows.
-            may_keep: False where resampling must take place, as their number changes.
-        """
-        weight = jnp.exp(log_weight)
+    def ancestors(
+        self, key: Key, weight: Float[Array, " p"], num: int
+    ) -> Int[Array, " p"]:
+        """`draw`, of rows that have a weight."""
         rows = self.draw(key, weight, num)
         # Rounding may lead past the last particle that has a weight.
-        rows = jnp.where(weight[rows] > 0, rows, jnp.argmax(weight))
-        place = jnp.arange(weight.size)
-        count = jnp.asarray(num, weight.dtype)
-        equal = jnp.where(place < num, -jnp.log(count), -jnp.inf)
-        size = effective_sample_size(log_weight)
-        keep = may_keep & (self.threshold < 1) & (size >= self.threshold * count)
-        rows = jnp.where(keep, place, rows).astype(jnp.int32)
-        return rows, jnp.where(keep, log_weight, equal)
+        return jnp.where(weight[rows] > 0, rows, jnp.argmax(weight)).astype(jnp.int32)
+
+    def replace(
+        self, key: Key, particles: Particles, num: int
+    ) -> tuple[Particles, Int[Array, " p"]]:
+        """Copies of equal weight."""
+        rows = self.ancestors(key, jnp.exp(particles.log_weight), num)
+        return particles.rows(rows).weighted(equal(particles.log_weight, num)), rows
+
+
+def equal(like: Float[Array, " p"], num: int) -> Float[Array, " p"]:
+    """Logarithms of equal weights of the first `num` rows."""
+    level = -jnp.log(jnp.asarray(num, like.dtype))
+    return jnp.where(jnp.arange(like.size) < num, level, -jnp.inf)
 
 
 def rows_at(weight: Float[Array, " p"], share: Float[Array, " q"]) -> Int[Array, " q"]:

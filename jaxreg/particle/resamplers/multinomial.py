@@ -5,17 +5,17 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
-from jaxreg.particle.resamplers.base import AbstractResampler, rows_at
+from jaxreg.particle.resamplers.base import AbstractHardResampler, rows_at
 
 
-class Multinomial(AbstractResampler):
+class Multinomial(AbstractHardResampler):
     """Each ancestor drawn independently: P(i) = weight_i.
 
     Gordon, Salmond, Smith 1993 (the PF paper, section 3.3, step 3): the number of
     copies is binomial, the largest variance of the four.
 
     Attributes:
-        threshold: see `AbstractResampler`.
+        threshold: see `AbstractHardResampler`.
     """
 
     threshold: Array | float = traced(1.0)

@@ -6,16 +6,16 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
-from jaxreg.particle.resamplers.base import AbstractResampler, rows_at
+from jaxreg.particle.resamplers.base import AbstractHardResampler, rows_at
 
 
-class Residual(AbstractResampler):
+class Residual(AbstractHardResampler):
     """floor(num * weight_i) copies of each, the rest drawn with what is left over.
 
     Liu and Chen 1998: the rest is multinomial with num * weight_i minus its floor.
 
     Attributes:
-        threshold: see `AbstractResampler`.
+        threshold: see `AbstractHardResampler`.
     """
 
     threshold: Array | float = traced(1.0)

@@ -6,16 +6,16 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
-from jaxreg.particle.resamplers.base import AbstractResampler, rows_at
+from jaxreg.particle.resamplers.base import AbstractHardResampler, rows_at
 
 
-class Stratified(AbstractResampler):
+class Stratified(AbstractHardResampler):
     """Row i where the cumulated weight passes (i + u_i) / num, u_i ~ U(0, 1) each.
 
     Kitagawa 1996. The number of copies differs from num * weight by less than two.
 
     Attributes:
-        threshold: see `AbstractResampler`.
+        threshold: see `AbstractHardResampler`.
     """
 
     threshold: Array | float = traced(1.0)

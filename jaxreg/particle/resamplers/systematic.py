@@ -6,17 +6,17 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.typing import Key
-from jaxreg.particle.resamplers.base import AbstractResampler, rows_at
+from jaxreg.particle.resamplers.base import AbstractHardResampler, rows_at
 
 
-class Systematic(AbstractResampler):
+class Systematic(AbstractHardResampler):
     """Row i where the cumulated weight passes (i + u) / num, one u ~ U(0, 1) for all.
 
     Kitagawa 1996; what the PF paper takes from its reference [18]. The number of copies
     is num * weight rounded up or down: the least variance of the four.
 
     Attributes:
-        threshold: see `AbstractResampler`.
+        threshold: see `AbstractHardResampler`.
     """
 
     threshold: Array | float = traced(1.0)
