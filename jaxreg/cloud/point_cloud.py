@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import spread_rows
@@ -115,11 +114,12 @@ def num_around(d: int) -> int:
 def spacing_around(found: Neighbours, mask: Mask) -> Float[Array, " n"]:
     """Mean distance to the nearest others, of neighbours with the point itself first.
 
-    Zero of points that are not valid or have none. Gradients: cut.
+    Zero of points that are not valid or have none. Gradients: of the distances.
     """
-    sq = lax.stop_gradient(found.sq_distance[:, 1:])
+    sq = found.sq_distance[:, 1:]
+    valid = found.valid[:, 1:] & mask[:, None] & (sq > 0)
+    total = jnp.sum(jnp.where(valid, jnp.sqrt(jnp.where(valid, sq, 1)), 0), axis=1)
     valid = found.valid[:, 1:] & mask[:, None]
-    total = jnp.sum(jnp.where(valid, jnp.sqrt(jnp.maximum(sq, 0)), 0), axis=1)
     return total / jnp.maximum(jnp.sum(valid, axis=1), 1)
 
 

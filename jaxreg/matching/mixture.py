@@ -24,6 +24,14 @@ _LEAST_ALIKE, _MOST_ALIKE = 4.0, 200.0
 _START = 0.5, 0.2, 4.0
 # Points that the mixture is fitted to, spread over the cloud.
 _FIT_POINTS = 1024
+# Width of the borders that numbers of points are differentiated at, in spacings. On
+# scans of the sculpture, moved by 0.1 spacings, changes of the share near are predicted
+# with correlations of 0.98; widths of 0.2 and more have 0.7 to 0.97, and one of 0.05
+# falls to 0.6 for steps of 0.02. (Of the evidence of four pairs of lidars and depth
+# cameras, not chosen on: 0.97 to 0.99 a spacing from the truth, and to 16 to 24 %; half
+# a spacing or less from it 0.93 to 0.98, and at the best pose, where slopes vanish, 0.5
+# to 0.9.)
+_BORDER = 0.1
 
 
 class Beside(eqx.Module):
@@ -36,6 +44,7 @@ class Beside(eqx.Module):
         log_cosine: between the normals.
         flat: whether both have one.
         mask: which are beside.
+        part: the same as a number, of which the derivative is smooth (`step`).
     """
 
     height: Float[Array, " n"]
@@ -43,6 +52,7 @@ class Beside(eqx.Module):
     log_cosine: Float[Array, " n"]
     flat: Bool[Array, " n"]
     mask: Bool[Array, " n"]
+    part: Float[Array, " n"]
 
     @classmethod
     def of(
@@ -54,13 +64,46 @@ class Beside(eqx.Module):
         flat = flat & jnp.any(found.source_normal != 0, axis=0)
         height = jnp.where(flat, jnp.abs(found.plane_residual), 0)
         along = found.sq_residual - height**2
-        height = jnp.where(flat, height, jnp.sqrt(found.sq_residual))
+        # The root of zero has no finite slope.
+        sq = jnp.where(flat | (found.sq_residual == 0), 1, found.sq_residual)
+        distance = jnp.where(found.sq_residual > 0, jnp.sqrt(sq), 0)
+        height = jnp.where(flat, height, distance)
         along = jnp.where(flat, along, 0)
         mask = found.mask & (reach > 0)
         mask = mask & (along < reach**2) & (height < ZONE * reach)
         log_cosine = 0.5 * jnp.log(jnp.maximum(found.agreement, 1e-6))
-        height = height / jnp.where(reach > 0, reach, 1)
-        return cls(height, reach, log_cosine, flat, mask)
+        unit = jnp.where(reach > 0, reach, 1)
+        height = height / unit
+        # In spacings from either border, of points near it.
+        inside = step((1 - along / unit**2) / 2) * step(ZONE - height)
+        inside = jnp.where(found.mask & (reach > 0), inside, 0)
+        part = followed(mask.astype(height.dtype), inside)
+        return cls(height, reach, log_cosine, flat, mask, part)
+
+    @property
+    def near(self) -> Float[Array, " n"]:
+        """One of those within a spacing of the plane, zero of the others; smooth."""
+        return self.part * step(1 - self.height)
+
+
+def step(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """One above zero, else zero; with the derivative of a steep logistic function.
+
+    A sum of steps is a number of points, which jumps as points cross a border. What it
+    changes by when all move a little is how many are near the border times how far they
+    move, and these are told from the points within about a fifth of a spacing of it.
+    """
+    return followed((x > 0).astype(x.dtype), jax.nn.sigmoid(x / _BORDER))
+
+
+def _positive(x: Scalar) -> Scalar:
+    """One where it is zero: of a sum of nothing, which has no finite inverse."""
+    return jnp.where(x > 0, x, 1)
+
+
+def followed(value: Float[Array, " n"], smooth: Float[Array, " n"]) -> Array:
+    """The value with the derivative of a smooth one."""
+    return value + (smooth - lax.stop_gradient(smooth))
 
 
 class Mixture(eqx.Module):
@@ -88,20 +131,19 @@ class Mixture(eqx.Module):
         """By expectation maximisation."""
         step = max(1, len(balance) // _FIT_POINTS)
         beside, balance = jax.tree.map(lambda x: x[::step], (beside, balance))
-        weight = jnp.where(beside.mask, balance, 0)
-        tiny = jnp.finfo(weight.dtype).tiny
-        total = jnp.maximum(jnp.sum(weight), tiny)
+        weight = beside.part * balance
+        total = _positive(jnp.sum(weight))
         half = (d - 1) / 2
 
         def improve(_: Array, now: Array) -> Array:
             mixture = cls(now[0], now[1], now[2], chance, d)
             part = weight * jax.nn.sigmoid(mixture.log_odds(beside))
-            some = jnp.maximum(jnp.sum(part), tiny)
+            some = _positive(jnp.sum(part))
             sq_width = jnp.sum(part * beside.height**2) / some
             apart = jnp.sum(part * -beside.log_cosine) / some
             alike = half / jnp.maximum(apart, half / (2 * _MOST_ALIKE)) - half
             share = jnp.clip(some / total, _LEAST_SHARE, 1 - _LEAST_SHARE)
-            width = jnp.clip(jnp.sqrt(sq_width), _LEAST_WIDTH, 1)
+            width = jnp.sqrt(jnp.clip(sq_width, _LEAST_WIDTH**2, 1))
             return jnp.stack([share, width, jnp.clip(alike, _LEAST_ALIKE, _MOST_ALIKE)])
 
         start = jnp.asarray(_START, weight.dtype)
@@ -125,8 +167,7 @@ class Mixture(eqx.Module):
     ) -> tuple[Scalar, Bool[Array, " n"]]:
         """Mean log-likelihood over that of chance, and the points on the surface."""
         odds = self.log_odds(beside)
-        weight = jnp.where(beside.mask, balance, 0)
+        weight = beside.part * balance
         gain = jax.nn.softplus(odds) + jnp.log1p(-self.share)
-        tiny = jnp.finfo(weight.dtype).tiny
-        mean = jnp.sum(weight * gain) / jnp.maximum(jnp.sum(weight), tiny)
+        mean = jnp.sum(weight * gain) / _positive(jnp.sum(weight))
         return mean, beside.mask & (odds > 0)

@@ -9,6 +9,7 @@ from helpers import blob, motion, move, pose_error
 from jaxtyping import Array
 
 import jaxreg as jr
+from jaxreg import particle
 from jaxreg._core.arrays import traced
 from jaxreg.local import LocalOptimiser
 from jaxreg.neighbours import IndexOptions
@@ -159,3 +160,79 @@ def test_a_filter_takes_any_index_with_options():
     assert repr(again) == "IndexOptions(VoxelTable, candidates=4, resolution=64)"
     with pytest.raises(TypeError, match=r"VoxelTable has the options .* found 'cells'"):
         IndexOptions(jr.VoxelTable, cells=4)
+
+
+def _settings(x: Array, resampler: particle.AbstractResampler) -> jr.ParticleFilter:
+    """Numbers of the filter and of its parts, changed by factors of exp(x)."""
+    factor = jnp.exp(x)
+    return jr.ParticleFilter(
+        num_prior=P,
+        num_particles=P // 2,
+        num_times=2,
+        prior_steps=2,
+        inner_steps=2,
+        batch_size=P // 2,
+        prior=particle.GaussianPrior(0.3 * factor[0], 0.5 * factor[1]),
+        dynamics=particle.StochasticDynamics(factor[2]),
+        energy=particle.BoundedEnergy(0.3 * factor[3]),
+        resampler=resampler,
+        sample_share=0.8 * factor[4],
+        width_start=0.3 * factor[5],
+        width_end=0.1 * factor[6],
+    )
+
+
+@pytest.mark.parametrize(
+    "resampler", [particle.Soft(0.5), particle.Transport(0.1)], ids=repr
+)
+def test_the_evidence_of_a_scan_has_the_slopes_of_differences(resampler):
+    with jax.enable_x64(True):
+        noise = np.random.default_rng(0).normal(size=(N, D))
+        source, target = SOURCE.astype(float), TARGET.astype(float)
+        source = move(np.linalg.inv(motion(7, D, 0.3)) @ TRUTH, source) + 2 * noise
+
+        def value(x):
+            """By seven settings, a range bias, a point of either cloud."""
+            off = source - source.mean(0)
+            moving = source + 1e-3 * x[7] * np.linalg.norm(off, axis=1)[:, None] * off
+            moving = moving.at[3, 0].add(x[8])
+            fixed = jnp.asarray(target).at[5, 1].add(x[9])
+            method = _settings(x[:7], resampler)
+            filtering = method.iteration(moving, fixed, key=KEY)
+            return filtering.scan(KEY)[0].log_evidence
+
+        # One program has values and slopes: compiling is what this costs.
+        along = jax.jit(jax.vmap(lambda x, e: jax.jvp(value, (x,), (e,)), (0, 0)))
+        zero, every = jnp.zeros((10, 10)), jnp.eye(10)
+        slopes = np.asarray(along(zero, every)[1])
+        ends = [np.asarray(along(s * 1e-7 * every, every)[0]) for s in (1, -1)]
+    differences = (ends[0] - ends[1]) / 2e-7
+    assert np.all(np.abs(differences) > 1e-3)
+    np.testing.assert_allclose(slopes, differences, rtol=1e-4)
+
+
+def test_a_scan_takes_the_steps_of_the_search_and_is_followed_backwards(
+    filtering, history
+):
+    @jax.jit
+    def both(scale):
+        def value(scale):
+            method = eqx.tree_at(
+                lambda m: m.width_start, filtering.method, scale * METHOD.width_start
+            )
+            state, info = particle.Filtering(method, filtering.problem).scan(KEY)
+            return state.log_evidence, (state, info)
+
+        slope, out = jax.grad(value, has_aux=True)(scale)
+        return jax.jvp(lambda x: value(x)[0], (scale,), (1.0,))[1], slope, out
+
+    forward, backward, (state, info) = both(1.0)
+    states, infos = history
+    np.testing.assert_allclose(
+        state.T_target_source, states[-1].T_target_source, atol=1e-4
+    )
+    np.testing.assert_array_equal(info.ancestors, [x.ancestors for x in infos])
+    assert float(state.log_evidence) == pytest.approx(
+        float(states[-1].log_evidence), abs=1e-2
+    )
+    assert float(backward) == pytest.approx(float(forward), rel=1e-3)
