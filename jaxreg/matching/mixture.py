@@ -44,7 +44,7 @@ class Beside(eqx.Module):
         log_cosine: between the normals.
         flat: whether both have one.
         mask: which are beside.
-        part: the same as a number, of which the derivative is smooth (`step`).
+        part: the same as a number, of which the derivative is smooth (`heaviside`).
     """
 
     height: Float[Array, " n"]
@@ -75,7 +75,7 @@ class Beside(eqx.Module):
         unit = jnp.where(reach > 0, reach, 1)
         height = height / unit
         # In spacings from either border, of points near it.
-        inside = step((1 - along / unit**2) / 2) * step(ZONE - height)
+        inside = heaviside((1 - along / unit**2) / 2) * heaviside(ZONE - height)
         inside = jnp.where(found.mask & (reach > 0), inside, 0)
         part = followed(mask.astype(height.dtype), inside)
         return cls(height, reach, log_cosine, flat, mask, part)
@@ -83,10 +83,10 @@ class Beside(eqx.Module):
     @property
     def near(self) -> Float[Array, " n"]:
         """One of those within a spacing of the plane, zero of the others; smooth."""
-        return self.part * step(1 - self.height)
+        return self.part * heaviside(1 - self.height)
 
 
-def step(x: Float[Array, " n"]) -> Float[Array, " n"]:
+def heaviside(x: Float[Array, " n"]) -> Float[Array, " n"]:
     """One above zero, else zero; with the derivative of a steep logistic function.
 
     A sum of steps is a number of points, which jumps as points cross a border. What it

@@ -105,7 +105,7 @@ def test_soft_copies_weigh_what_their_share_was_short_of():
         particles = _particles(WEIGHT)
         share = 0.25 * WEIGHT + 0.75 * (WEIGHT > 0) / 10
         keys = jax.random.split(jax.random.key(0), 2000)
-        soft = Soft(0.25, Multinomial())
+        soft = Soft(0.25, draws=Multinomial())
         draw = jax.jit(jax.vmap(lambda key: soft.replace(key, particles, NUM)))
         after, rows = jax.device_get(draw(keys))
         rows = rows[:, :NUM]
@@ -124,7 +124,7 @@ def test_soft_copies_weigh_what_their_share_was_short_of():
 def _sinkhorn(cost: np.ndarray, weight: np.ndarray, epsilon: float) -> np.ndarray:
     """The plan by thousands of steps of scaling rows and columns."""
     K = weight[:, None] * np.exp(-cost / epsilon)
-    v = np.ones(cost.shape[1])
+    u, v = weight, np.ones(cost.shape[1])
     for _ in range(5000):
         u = weight / (K @ v)
         v = 1 / len(v) / (K.T @ u)
@@ -209,4 +209,4 @@ def test_shares_and_entropies_that_are_none_are_refused():
     with pytest.raises(ValueError, match=r"Transport.*epsilon.*0"):
         Transport(0.0)
     with pytest.raises(TypeError, match="draws"):
-        Soft(draws=Transport())
+        Soft(draws=Transport())  # pyright: ignore[reportArgumentType]
