@@ -90,7 +90,9 @@ def test_soft_matches_find_the_pose_as_well():
     errors = {}
     for name, method in METHODS.items():
         T = answer(jnp.zeros(CHANGES), method)
-        errors[name] = float(lie.rotation_angle(lie.rotation(T @ np.linalg.inv(T_TRUE))))
+        errors[name] = float(
+            lie.rotation_angle(lie.rotation(T @ np.linalg.inv(T_TRUE)))
+        )
     assert errors["soft"] < 1.2 * errors["closest"] + 1e-3
 
 
