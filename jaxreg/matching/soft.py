@@ -112,7 +112,7 @@ class Surroundings(eqx.Module):
 
 
 def _fading(sq: Float[Array, "n k"], h: Scalar) -> Float[Array, "n k"]:
-    """exp(-sq / 2 h^2), less what that is at the end of the nearer third; at least zero.
+    """exp(-sq / 2 h^2), less its value at the end of the nearer third; at least zero.
 
     So points come and go with a weight of zero. The nearer third of those around the
     closest point are nearly always the nearest of all.

@@ -177,10 +177,10 @@ def _judged(
     if log_prior is not None:
         told = evidence.log_evidence + jax.vmap(log_prior)(T)
         evidence = dataclasses.replace(evidence, log_evidence=told)
-    # Proposals count that are held, and by more than a patch: particles descend to where
-    # clouds share much, and the evidence was learned there; features find small patches
-    # that fit each other as if they were the same (9 % of two scans of opposite sides
-    # of the sculpture).
+    # Proposals count that are held, and by more than a patch: particles descend to
+    # where clouds share much, and the evidence was learned there; features find small
+    # patches that fit each other as if they were the same (9 % of two scans of opposite
+    # sides of the sculpture).
     holds = evidence.grip.holds
     counts = holds & (evidence.overlap >= _LEAST_SHARED)
     sound = sound & ((jnp.arange(len(sound)) < num_modes) | counts)

@@ -190,8 +190,8 @@ class Filtering(eqx.Module):
         matter to what sends particles elsewhere: of a small filter with `Transport` the
         mean slopes of 2,000 keys by widths, the energy and `sample_share` are 1 to 9 %
         from differences of means by 20 %, that by the scale of the diffusion is 0.6 and
-        those by spreads of the prior are 0.2 to 0.3 of theirs; with `Systematic` a slope of
-        the latter has the wrong sign.
+        those by spreads of the prior are 0.2 to 0.3 of theirs; with `Systematic` a
+        slope of the latter has the wrong sign.
         """
         method = dataclasses.replace(self.method, num_agreeing=0)
         filtering = Filtering(method, self.problem)
