@@ -177,13 +177,9 @@ def _judged(
     if log_prior is not None:
         told = evidence.log_evidence + jax.vmap(log_prior)(T)
         evidence = dataclasses.replace(evidence, log_evidence=told)
-    # Proposals count that are held, and by more than a patch: particles descend to
-    # where clouds share much, and the evidence was learned there; features find small
-    # patches that fit each other as if they were the same (9 % of two scans of opposite
-    # sides of the sculpture).
     holds = evidence.grip.holds
-    counts = holds & (evidence.overlap >= _LEAST_SHARED)
-    sound = sound & ((jnp.arange(len(sound)) < num_modes) | counts)
+    first = jnp.arange(len(sound)) < num_modes
+    sound = sound & (first | _convincing(evidence.overlap, holds))
     found = _Candidates(T, mass, sound, evidence, holds)
     order = jnp.arange(num_modes)
     if refine_steps:
@@ -240,6 +236,18 @@ def _followed(
     first = jnp.where(sound[0], first, T[0])
     others = followed(optimiser, problem, width, T[1:], sound[1:])
     return jnp.concatenate([first[None], others])
+
+
+def _convincing(
+    overlap: Float[Array, " q"], holds: Bool[Array, " q"]
+) -> Bool[Array, " q"]:
+    """Which proposals count: those that are held, and by more than a patch.
+
+    Particles descend to where clouds share much; the evidence was learned there.
+    Features find small patches that fit each other as if they were the same: 9 % of
+    two scans of opposite sides of the sculpture.
+    """
+    return holds & (overlap >= _LEAST_SHARED)
 
 
 def _has_rival(

@@ -1,11 +1,10 @@
 """Weights of modes, and when one of them rivals the first."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.matching import NO_EVIDENCE, Evidence
+from jaxreg.matching import NO_EVIDENCE
 from jaxreg.matching.slippage import Grip
 from jaxreg.particle.conclude import _convincing, _has_rival, _weights
 
@@ -59,7 +58,5 @@ def test_proposals_count_if_they_share_enough_and_hold(overlap, held, counts):
     # Planes of all directions about the origin, or of one.
     H = np.eye(6) if held else np.diag([1.0, 0, 0, 0, 0, 0])
     grip = Grip(*(jnp.asarray(x, jnp.float32) for x in (H, np.zeros(3), 1.0)))
-    zero = jnp.zeros((), jnp.float32)
-    evidence = Evidence(zero, zero + overlap, zero, zero, jnp.zeros((), int), grip)
-    one = jax.tree.map(lambda x: x[None], evidence)
-    np.testing.assert_array_equal(_convincing(one), [counts])
+    found = _convincing(jnp.asarray([overlap]), grip.holds[None])
+    np.testing.assert_array_equal(found, [counts])
