@@ -128,7 +128,7 @@ KERNELS = [
 RESAMPLERS = [
     particle.Multinomial(),
     particle.Residual(1.0),
-    particle.Soft(0.5, threshold=0.7),
+    particle.Soft(alpha=0.5, threshold=0.7),
     particle.Stratified(),
     particle.Systematic(0.3),
     particle.Transport(),

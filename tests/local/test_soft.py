@@ -44,8 +44,8 @@ def changed(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         points = EYE + ray * (1 + x[0] / length + x[1] * length)
         return points * jnp.asarray([1, 1 + x[2], 1])
 
-    moved = target + x[3] * rng.standard_normal(target.shape)
-    return seen(jnp.asarray(source)), seen(moved)
+    moved = jnp.asarray(target) + x[3] * rng.standard_normal(target.shape)
+    return seen(jnp.asarray(source)), seen(jnp.asarray(moved))
 
 
 @eqx.filter_jit
