@@ -88,7 +88,7 @@ class ICP(AbstractRegistrar):
             are those of the pose at that factor.
         soft: means over the surroundings of the closest points in place of these, and
             normals and spacing that change as smoothly: for derivatives that hold for
-            more than the least change. Ten times slower; `max_points` should not be
+            more than the least change. Twenty times slower; `max_points` should not be
             less than there are. None: the closest points.
         adjoint: `ImplicitAdjoint()`, or `RecursiveCheckpointAdjoint()` for few steps
             taken on purpose.
@@ -107,7 +107,7 @@ class ICP(AbstractRegistrar):
     which points are merged and which cells normals are taken from: of two clouds of 300
     points with a noise of a quarter of their spacing, differences of 1e-7 agree to
     1e-6, but those of 1e-4 and more exchange matches, and differ several times over.
-    With `soft=SoftMatches()` those of 1e-3 agree within 4 % there, and within 5 % on
+    With `soft=SoftMatches()` those of 1e-3 agree within 4 % there, and within 10 % on
     scans of two lidars and an object, 4,000 points of each. A width above `width_end`
     has the slope of the residual that it was taken from: exact if the last step took
     it, but not if an earlier one did. Directions that are free do not move, and nothing
