@@ -125,6 +125,9 @@ class RegistrationSolution(eqx.Module):
             lengths are in the unit of the input.
         modes: distinct poses with weights; one for a local method.
         trace: how a particle filter came to rest; None for other methods.
+
+    Gradients: of the poses, as the method says. Scores and evidence are held: that of a
+    pose has a derivative by `jaxreg.matching.Witness.of_pose`.
     """
 
     T_target_source: Float[Array, "*b D D"]
