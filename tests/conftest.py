@@ -17,8 +17,10 @@ os.environ.setdefault("MPLBACKEND", "agg")
 # Compiling is what most tests cost; `fully_compiled` is for those that compute.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # The older of two generators of kernels takes half of the time; later there is but one.
-if version("jaxlib").startswith("0.10."):
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+_FLAGS = ["--xla_cpu_use_fusion_emitters=false"] * version("jaxlib").startswith("0.10.")
+# For what spreads over devices; all else stays on the first.
+_FLAGS += ["--xla_force_host_platform_device_count=8"]
+os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
 
 
 def pytest_collection_finish() -> None:

@@ -12,6 +12,8 @@ import equinox.internal as eqxi
 from jax import lax
 from jaxtyping import Array
 
+from jaxreg._core import control
+
 
 State = TypeVar("State")
 Tree = TypeVar("Tree")
@@ -67,7 +69,7 @@ class ImplicitAdjoint(AbstractAdjoint):
         max_steps: int,
     ) -> State:
         """`lax.while_loop`; `unfinished` counts the steps."""
-        return lax.while_loop(unfinished, body, start)
+        return control.while_loop(unfinished, body, start)
 
 
 class RecursiveCheckpointAdjoint(AbstractAdjoint):
@@ -93,8 +95,8 @@ class RecursiveCheckpointAdjoint(AbstractAdjoint):
         """Binomial checkpointing (Stumm and Walther 2010)."""
         return eqxi.while_loop(
             unfinished,
-            body,
-            start,
+            lambda state: control.varying(body(state)),
+            control.varying(start),
             max_steps=max_steps,
             kind="checkpointed",
             checkpoints=self.checkpoints,

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core import control
+
 
 def masked_quantile(
     x: Float[Array, " n"], mask: Bool[Array, " n"], share: Float[Array, ""] | float
@@ -66,5 +68,5 @@ def _value_of(
         below = jnp.sum(keys < trial, dtype=jnp.int32)
         return jnp.where(below < rank, trial, found)
 
-    found = lax.fori_loop(0, bits, set_bit, jnp.zeros((), kind))
+    found = control.fori_loop(0, bits, set_bit, jnp.zeros((), kind))
     return jnp.where(count > 0, lax.bitcast_convert_type(found, x.dtype), 0)

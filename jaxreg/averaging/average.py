@@ -3,12 +3,15 @@
 from collections.abc import Sequence
 from typing import overload
 
+from jax.sharding import AbstractMesh, Mesh
+
 from jaxreg._core.checks import check_callable, check_count, check_key, check_method
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
-from jaxreg.averaging.many import average_list, check_init
+from jaxreg.averaging.many import average_batch, average_list, check_init
 from jaxreg.averaging.methods.correntropy import Correntropy
+from jaxreg.batching.devices import chosen_devices
 from jaxreg.graph.pose_graph import PoseGraph, check_graph
 
 
@@ -21,6 +24,7 @@ def average(
     *,
     batch_size: int = 1,
     progress: Progress | None = None,
+    mesh: Mesh | AbstractMesh | None = None,
 ) -> AveragingSolution: ...
 
 
@@ -33,6 +37,7 @@ def average(
     *,
     batch_size: int = 1,
     progress: Progress | None = None,
+    mesh: Mesh | AbstractMesh | None = None,
 ) -> list[AveragingSolution]: ...
 
 
@@ -44,6 +49,7 @@ def average(
     *,
     batch_size: int = 1,
     progress: Progress | None = None,
+    mesh: Mesh | AbstractMesh | None = None,
 ) -> AveragingSolution | list[AveragingSolution]:
     """Finds poses that agree with relative motions: `T_i_j = inv(T_world_i) T_world_j`.
 
@@ -62,20 +68,23 @@ def average(
         Array([0. , 1.1, 2.2], dtype=float32)
 
     Args:
-        graph: the relative motions, see `PoseGraph.from_edges`; or a list of graphs of
-            any sizes.
+        graph: the relative motions, see `PoseGraph.from_edges`; a list of graphs of any
+            sizes; or a batch, a PoseGraph with a leading axis on all arrays.
         method: how to average; None for `Correntropy()`.
         init: `(v, d+1, d+1)` poses to start from, or None to start from the motions
-            alone, as the method's docstring says. For a list of graphs a list.
-        key: for methods that draw random numbers; the others ignore it. A list of
-            graphs gets one key each by splitting.
-        batch_size: graphs of a list that are averaged side by side. On a CPU one after
-            another is quickest; memory grows with it.
+            alone, as the method's docstring says. For a list of graphs a list, for a
+            batch with its leading axis.
+        key: for methods that draw random numbers; the others ignore it. Many graphs
+            get one key each by splitting.
+        batch_size: of many graphs, those that are averaged side by side. On a CPU one
+            after another is quickest; memory grows with it.
         progress: called as `progress(stage, done, total)` as some graphs of a list are
-            done; not for one graph, not under `jit`.
+            done; not for one graph or a batch, not under `jit`.
+        mesh: a mesh of devices with an axis "pair", over which many graphs are spread,
+            as `register` spreads pairs: without it they stay where a batch is.
 
     Returns:
-        An `AveragingSolution`, with leading axes under `vmap`; for a list a list of
+        An `AveragingSolution`, with leading axes for a batch; for a list a list of
         them, one for each graph. Status DISCONNECTED: some frames are not joined to
         frame 0 by edges of positive weight, see `placed`.
         NON_FINITE: edges or poses with NaN or inf were met; such edges are ignored,
@@ -89,8 +98,9 @@ def average(
         TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,
             `method` no averaging method, or `key` no key.
         ValueError: if `init` has another shape than the poses or is no rigid motion
-            within 1e-2, several graphs are given as one, or the graphs of a list
-            differ in dimension or in whether they have information.
+            within 1e-2, a batch has several leading axes, the graphs of a list differ
+            in dimension or in whether they have information, or the mesh has no axis
+            "pair".
 
     Gradients: see the method. `T_world_i` always follows `init[0]`.
 
@@ -105,6 +115,10 @@ def average(
     check_callable(progress, "progress")
     key = None if key is None else check_key(key)
     if isinstance(graph, list | tuple):
-        return average_list(graph, method, init, key, batch_size, progress)
+        how = batch_size, progress, chosen_devices(mesh)
+        return average_list(graph, method, init, key, *how)
+    devices = chosen_devices(mesh, getattr(graph, "T_i_j", None))
+    if isinstance(graph, PoseGraph) and graph.edges.ndim == 3:
+        return average_batch(graph, method, init, key, batch_size, devices)
     one = check_graph(graph, "graph")
     return average_graph(one, method, check_init(init, one, "init"), key)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core import control
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
@@ -16,6 +17,7 @@ from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
 
 
+@control.over_devices
 def average_graph(
     graph: PoseGraph,
     method: AbstractAverager,

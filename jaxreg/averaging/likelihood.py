@@ -40,6 +40,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg.averaging.measures import length_scale, nearest_rank, num_held
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
@@ -105,7 +106,7 @@ def nothing_agrees(graph: PoseGraph, evidence: Float[Array, ""]) -> Bool[Array, 
         return log_evidence(graph, trees.maximum_spanning_tree(*args).T_world_i) <= 0
 
     none = spare & (evidence <= 0)
-    return jax.lax.cond(none, of_tree, lambda: jnp.asarray(False))
+    return control.cond(none, of_tree, lambda: jnp.asarray(False))
 
 
 def explained(

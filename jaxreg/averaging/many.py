@@ -10,14 +10,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxreg._core.checks import check_rigid, is_concrete
+from jaxreg._core.checks import as_float_array, check_rigid, is_concrete
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
+from jaxreg.batching.devices import Devices, map_rows, spread_rows
 from jaxreg.batching.padding import rounded_up, stacked
 from jaxreg.batching.progress import tell
 from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
 
+
+# Graphs, which frames they have, their starts and keys; a leading axis on all arrays.
+_Lanes = tuple[PoseGraph, Array | None, Array | None, Array | None]
 
 # The least number of poses that graphs are padded to, and half that of edges: a power
 # of two; smaller programs take as long to compile.
@@ -45,6 +49,7 @@ def average_list(
     key: Key | None,
     batch_size: int,
     progress: Progress | None,
+    devices: Devices | None,
 ) -> list[AveragingSolution]:
     """`average` of each; graphs of similar sizes share a program."""
     checked = _check_alike(graphs)
@@ -58,12 +63,34 @@ def average_list(
         starts = None if inits is None else [inits[k] for k in rows]
         lanes = _padded(some, starts, *padded_to)
         own_keys = None if keys is None else keys[rows]
-        found = _average_lanes(method, *lanes, own_keys, batch_size)
+        found = _average_lanes(method, (*lanes, own_keys), batch_size, devices)
         if is_concrete(found.status):
             found = jax.tree.map(np.asarray, found)  # slices compile nothing
         out |= {k: _cut(found, lane, checked[k]) for lane, k in enumerate(rows)}
         tell(progress, stage, len(out), len(checked), found)
     return [out[k] for k in range(len(checked))]
+
+
+def average_batch(
+    graphs: PoseGraph,
+    method: AbstractAverager,
+    init: object,
+    key: Key | None,
+    batch_size: int,
+    devices: Devices | None,
+) -> AveragingSolution:
+    """Of graphs of one size, with a leading axis on every array."""
+    num, frames, D = len(graphs.T_i_j), graphs.num_poses, graphs.dim + 1
+    starts = None
+    if init is not None:
+        starts = as_float_array(init, "init").astype(graphs.T_i_j.dtype)
+        if starts.shape != (num, frames, D, D):
+            raise ValueError(
+                f"init: wanted shape {(num, frames, D, D)}, found {starts.shape}."
+            )
+        check_rigid(starts, "init")
+    keys = None if key is None else jax.random.split(key, num)
+    return _average_lanes(method, (graphs, None, starts, keys), batch_size, devices)
 
 
 def _pieces(
@@ -134,23 +161,24 @@ def _padded(
 
 @eqx.filter_jit
 def _average_lanes(
-    method: AbstractAverager,
-    graphs: PoseGraph,
-    present: Array,
-    inits: Array | None,
-    keys: Array | None,
-    batch_size: int,
+    method: AbstractAverager, lanes: _Lanes, batch_size: int, devices: Devices | None
 ) -> AveragingSolution:
-    def one(lane: tuple) -> AveragingSolution:
+    def one(lane: _Lanes) -> AveragingSolution:
         graph, present, init, key = lane
-        if init is not None:
+        if init is not None and present is not None:
             eye = jnp.eye(init.shape[-1], dtype=init.dtype)
             init = jnp.where(present[:, None, None], init, eye)
         return average_graph(graph, method, init, key, present)
 
     # Groups of one would be vectorised over an axis of one: conditions become selects.
     size = batch_size if batch_size > 1 else None
-    return lax.map(one, (graphs, present, inits, keys), batch_size=size)
+
+    def some(lanes: _Lanes) -> AveragingSolution:
+        return lax.map(one, lanes, batch_size=size)
+
+    if devices is None:
+        return some(lanes)
+    return map_rows(devices, some, spread_rows(devices, lanes))
 
 
 def _cut(found: AveragingSolution, lane: int, graph: PoseGraph) -> AveragingSolution:

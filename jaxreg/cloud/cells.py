@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.neighbours.sorting import rows_in_order
 
@@ -113,4 +114,4 @@ def at_most(
 
     # Starts below and not in order, so that the order is computed in one place.
     start = jnp.arange(points.shape[0], dtype=jnp.int32)
-    return lax.while_loop(too_many, coarser, (size / 1.05, start, start))
+    return control.while_loop(too_many, coarser, (size / 1.05, start, start))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.geometry.boxes import bounding_box
 
@@ -61,7 +62,7 @@ def without_noise(points: Points, mask: Mask) -> Mask:
         enough = jnp.sum(keep) >= _LEFT * jnp.sum(mask)
         return jnp.where(enough, keep, mask)
 
-    return lax.cond(amount >= _LEAST, denser, lambda _: mask, places)
+    return control.cond(amount >= _LEAST, denser, lambda _: mask, places)
 
 
 def _most_noise(places: Points, mask: Mask) -> Scalar:

@@ -20,6 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Scalar
 from jaxreg.cloud.cells import UNUSED, bits_per_axis, morton_keys
 from jaxreg.geometry.eigen import least_eigenvectors
@@ -98,10 +99,10 @@ class Windows(eqx.Module):
         @jax.checkpoint
         def fill(normals: Array, level: Array) -> tuple[Array, None]:
             used = jnp.any(self.level == level)
-            return lax.cond(used, at_level, lambda x, _: x, normals, level), None
+            return control.cond(used, at_level, lambda x, _: x, normals, level), None
 
         levels = jnp.arange(_COARSEST + 1, dtype=jnp.int32)
-        return lax.scan(fill, jnp.zeros_like(self.places.T), levels)[0].T
+        return control.scan(fill, jnp.zeros_like(self.places.T), levels)[0].T
 
 
 @eqx.filter_custom_jvp
@@ -152,12 +153,12 @@ def _search(
             )
 
         blocks = -(-jnp.sum(~done) // width)
-        out = lax.fori_loop(0, blocks, block, (normals, levels, done))
+        out = control.fori_loop(0, blocks, block, (normals, levels, done))
         return level + 1, *out
 
     level, none = jnp.asarray(finest, jnp.int32), jnp.full(p, -1, jnp.int32)
     start = level, jnp.zeros((d, p), points.dtype), none, ~mask
-    _, normals, levels, _ = lax.while_loop(unfinished, fill, start)
+    _, normals, levels, _ = control.while_loop(unfinished, fill, start)
     return normals.T, levels
 
 

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Scalar
 from jaxreg.features.correspond import Correspondences
 from jaxreg.geometry import lie
@@ -69,7 +70,7 @@ def consistent_poses(pairs: Correspondences, tolerance: Scalar) -> Agreed:
         return T, _agreeing(pairs, T, tolerance).astype(agree.dtype)
 
     start = lie.identity(3, common.dtype, (num,)), agree
-    T, agree = lax.fori_loop(0, _FITS, fit, start)
+    T, agree = control.fori_loop(0, _FITS, fit, start)
     number = jnp.where(pairs.mask, jnp.sum(agree, axis=1), 0)
     return Agreed(T, number.astype(jnp.int32))
 

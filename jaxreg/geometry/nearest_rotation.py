@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core import control
 from jaxreg.linear.small import jacobi_rotation, num_sweeps, solve_semidefinite
 
 
@@ -69,7 +70,7 @@ def _in_space(M: Array) -> Array:
     US = jnp.swapaxes(M / jnp.where(largest > 0, largest, 1), -1, -2)
     V = jnp.broadcast_to(jnp.eye(3, dtype=M.dtype), M.shape)
     sweeps = num_sweeps(M.dtype)
-    US, V = lax.fori_loop(0, sweeps, lambda _, both: _swept(*both), (US, V))
+    US, V = control.fori_loop(0, sweeps, lambda _, both: _swept(*both), (US, V))
     order = jnp.argsort(-jnp.sum(US * US, axis=-1), axis=-1)[..., None]
     US, V = (jnp.take_along_axis(x, order, axis=-2) for x in (US, V))
     u = _unit(US[..., 0, :])

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.arrays import spread_rows
 from jaxreg._core.typing import Mask, Points
 
@@ -51,5 +52,5 @@ def _other(
         nearest = jnp.min(jnp.where(keys > last, keys, far))
         return jnp.where(nearest < far, nearest, last)
 
-    last = lax.fori_loop(0, 2 * (d - 1), next_nearest, jnp.full((), -1, bits_type))
+    last = control.fori_loop(0, 2 * (d - 1), next_nearest, jnp.full((), -1, bits_type))
     return jnp.where(last >= 0, last & row_mask, -1).astype(jnp.int32)

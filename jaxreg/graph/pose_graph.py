@@ -221,7 +221,7 @@ def check_graph(graph: object, name: str) -> PoseGraph:
     if graph.edges.ndim != 2:
         raise ValueError(
             f"{name}: wanted one graph, found leading axes {graph.edges.shape[:-2]}. "
-            "Use jax.vmap, or a list of graphs."
+            "Use a list of graphs, or jax.vmap."
         )
     return graph
 

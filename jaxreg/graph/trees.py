@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
 
@@ -57,7 +58,7 @@ def components(
         return new[new], jnp.any(new != label)
 
     start = jnp.arange(num_poses, dtype=jnp.int32)
-    return jax.lax.while_loop(lambda s: s[1], spread, (start, jnp.asarray(True)))[0]
+    return control.while_loop(lambda s: s[1], spread, (start, jnp.asarray(True)))[0]
 
 
 class _Boruvka(NamedTuple):
@@ -87,7 +88,7 @@ def maximum_spanning_tree(
         in_tree=jnp.zeros(weight.shape, dtype=bool),
         joined=jnp.asarray(True),
     )
-    end = jax.lax.while_loop(
+    end = control.while_loop(
         lambda s: s.joined,
         lambda s: _join_components(s, edges, T_i_j, weight),
         start,
@@ -157,7 +158,7 @@ def follow(
     def unfinished(state: tuple[Array, Array]) -> Array:
         return jnp.any(state[0] != state[0][state[0]])
 
-    return jax.lax.while_loop(unfinished, jump, (parent, T_parent_i))
+    return control.while_loop(unfinished, jump, (parent, T_parent_i))
 
 
 class Paths(eqx.Module):
@@ -204,7 +205,7 @@ def shortest_paths(
         return new, jnp.any(new < reach)
 
     start = jnp.full((num_poses,), jnp.inf, T_i_j.dtype).at[root].set(0)
-    reach, _ = jax.lax.while_loop(lambda s: s[1], relax, (start, jnp.asarray(True)))
+    reach, _ = control.while_loop(lambda s: s[1], relax, (start, jnp.asarray(True)))
     reached = jnp.isfinite(reach)
     # The parent is the best neighbour that is strictly nearer: no cycles by rounding.
     via_i = jnp.where(reach[i] < reach[j], reach[i] + length, jnp.inf)

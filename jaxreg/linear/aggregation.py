@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
+
 
 _PAIRINGS, _OFFERS = 3, 4
 #: Frames over aggregates, and edges over those that stay between aggregates at most.
@@ -44,7 +46,7 @@ def aggregate(
         return _paired(label[i], label[j], strength, num)[label]
 
     frames = jnp.arange(num, dtype=jnp.int32)
-    label = jax.lax.fori_loop(0, _PAIRINGS, pair, frames)
+    label = control.fori_loop(0, _PAIRINGS, pair, frames)
     count = -(-num // RATIO)
     reached = jnp.zeros((num,), bool).at[i].max(strength > 0).at[j].max(strength > 0)
     root = (label == frames) & reached
@@ -75,7 +77,7 @@ def _paired(i: Array, j: Array, strength: Array, num: int) -> Int[Array, " v"]:
         mate = mate.at[jnp.where(agreed, i, num)].set(j, mode="drop")
         return mate.at[jnp.where(agreed, j, num)].set(i, mode="drop")
 
-    mate = jax.lax.fori_loop(0, _OFFERS, offer, frames)
+    mate = control.fori_loop(0, _OFFERS, offer, frames)
     root, free = jnp.minimum(frames, mate), mate == frames
     to_j = jnp.where(free[i] & ~free[j], wish, 0)
     to_i = jnp.where(free[j] & ~free[i], wish, 0)

@@ -7,9 +7,10 @@ vanishing curvature grows with their number. Here such a direction ends the sear
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from jaxreg._core import control
 
 
 _Linear = Callable[[Array], Array]
@@ -75,5 +76,5 @@ def conjugate_gradients(
     begin = _State(
         zero, rhs, zero, zero, none, none + jnp.inf, none, jnp.asarray(0, jnp.int32)
     )
-    end = jax.lax.while_loop(unfinished, step, begin)
+    end = control.while_loop(unfinished, step, begin)
     return end.x, end.step

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core import control
 from jaxreg.linear.aggregation import RATIO, aggregate
 from jaxreg.linear.krylov import conjugate_gradients
 from jaxreg.linear.operator import GraphLaplacian, matmul
@@ -108,7 +109,7 @@ def _coarser(matrix: GraphLaplacian) -> tuple[_Level, GraphLaplacian]:
     lost = jnp.where(agg.lost[:, None, None], weight, 0)
     # Edges without room tie both ends to the ground: at least half as stiff, and stiff
     # where both ends move alike, so still safe.
-    own = jax.lax.cond(
+    own = control.cond(
         jnp.any(agg.lost),
         lambda: own.at[agg.parent[i]].add(lost).at[agg.parent[j]].add(lost),
         lambda: own,

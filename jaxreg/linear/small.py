@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core import control
+
 
 def after(x: Array, earlier: Array) -> Array:
     """The same x, computed after `earlier`: a chain for two calls of LAPACK.
@@ -199,7 +201,7 @@ def eigh(
     V = jnp.broadcast_to(jnp.eye(size, dtype=A.dtype), A.shape)
     rounds = num_sweeps(A.dtype, size) * (size - 1)
     # Those of as many rounds as end where the tournament began.
-    A, V = lax.fori_loop(0, rounds, lambda _, state: _turned(*state), (A, V))
+    A, V = control.fori_loop(0, rounds, lambda _, state: _turned(*state), (A, V))
     value = jnp.diagonal(A, axis1=-2, axis2=-1)[..., :n] * unit[..., 0]
     order = jnp.argsort(value, axis=-1)
     vector = jnp.take_along_axis(V[..., :n, :n], order[..., None, :], axis=-1)

@@ -1,9 +1,9 @@
 """One iteration of a local optimiser."""
 
 import equinox as eqx
-from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core import control
 from jaxreg._core.typing import Motion
 from jaxreg.local.steps import AbstractStep
 from jaxreg.matching.problem import Match, Problem, match
@@ -47,4 +47,4 @@ class LocalOptimiser(eqx.Module):
         def body(T: Array, width: Array) -> tuple[Array, None]:
             return self(problem, T, width), None
 
-        return lax.scan(body, T_target_source, widths)[0]
+        return control.scan(body, T_target_source, widths)[0]

@@ -39,6 +39,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.arrays import on_both
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import PointCloud, levelled
@@ -175,7 +176,7 @@ class Witness(eqx.Module):
             problem, T, *rest = way
 
             def one(pose: tuple[Motion, Array]) -> _Way:
-                return lax.cond(
+                return control.cond(
                     pose[1], lambda T: _one_way(problem, T, *rest), _nothing, pose[0]
                 )
 

@@ -8,10 +8,10 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core import control
 from jaxreg._core.typing import Scalar
 from jaxreg.matching.chance import ZONE
 from jaxreg.matching.problem import Match
@@ -154,7 +154,7 @@ class Mixture(eqx.Module):
             return jnp.stack([share, width, jnp.clip(alike, _LEAST_ALIKE, _MOST_ALIKE)])
 
         start = jnp.asarray(_START, weight.dtype)
-        share, width, alike = lax.fori_loop(0, _FIT_STEPS, improve, start)
+        share, width, alike = control.fori_loop(0, _FIT_STEPS, improve, start)
         return cls(share, width, alike, chance, d)
 
     def log_odds(self, beside: Beside) -> Float[Array, " n"]:

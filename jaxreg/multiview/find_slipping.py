@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
 from jaxreg.graph.trees import components
@@ -71,4 +72,4 @@ def _bodies(pairs: Int[Array, "e 2"], grips: Grip, num_scans: int) -> Int[Array,
         return new, jnp.any(new != body)
 
     start = jnp.arange(num_scans, dtype=jnp.int32)
-    return lax.while_loop(lambda s: s[1], joined, (start, jnp.asarray(True)))[0]
+    return control.while_loop(lambda s: s[1], joined, (start, jnp.asarray(True)))[0]

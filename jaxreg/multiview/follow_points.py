@@ -9,6 +9,7 @@ import jax
 from jax import lax
 from jaxtyping import Array
 
+from jaxreg._core import control
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.local import LocalOptimiser, Rest, at_rest
 from jaxreg.matching import Problem
@@ -50,7 +51,7 @@ def follow_points(
 
     def one(of: tuple[Array, Motion, Scalar]) -> Motion:
         pair, T_i_j, told = of
-        return lax.cond(told >= least, measured, lambda _, T: T, pair, T_i_j)
+        return control.cond(told >= least, measured, lambda _, T: T, pair, T_i_j)
 
     of = motions.pairs, motions.T_i_j[:, 0], motions.log_evidence[:, 0]
     T_i_j = lax.map(one, of)

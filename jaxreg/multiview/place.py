@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Scalar, StatusArray
 from jaxreg.averaging import (
     AbstractAverager,
@@ -114,7 +115,7 @@ def place(
         found = _averaged(motions, mode, num_scans, averaging, least)
         return _agreeing(motions, found, least), found
 
-    _, passes = lax.scan(again, best, None, length=_PASSES)
+    _, passes = control.scan(again, best, None, length=_PASSES)
     return jax.tree.map(lambda x: x[-1], passes)
 
 
@@ -242,4 +243,4 @@ def _confirmed_components(
         return new, jnp.any(new != part)
 
     core = components(pairs, jnp.where(strong, weight, 0), num_scans)
-    return lax.while_loop(lambda s: s[1], joined, (core, jnp.asarray(True)))[0]
+    return control.while_loop(lambda s: s[1], joined, (core, jnp.asarray(True)))[0]

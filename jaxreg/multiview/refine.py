@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core import control
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
@@ -112,7 +113,7 @@ def measured(
         T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
         found, together = scans.witness(i, j).of_pose(T_i_j), placement.together(i, j)
         told = jnp.where(together, found.log_evidence, NO_EVIDENCE)
-        T_i_j = lax.cond(told >= least, measured, lambda _: T_i_j, pair)
+        T_i_j = control.cond(told >= least, measured, lambda _: T_i_j, pair)
         return RelativeMotions(
             pair, T_i_j[None], found.overlap[None], told[None], found.inlier_rmse[None]
         )

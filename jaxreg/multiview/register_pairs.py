@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core import control
 from jaxreg._core.typing import Key, Progress, Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.threads import map_in_threads
@@ -186,7 +187,7 @@ def _prospects(
         i, j = pair
         T_i_j = lie.inverse(T[i]) @ T[j]
         problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
-        return lax.cond(
+        return control.cond(
             found.together(i, j),
             lambda: _near(match(problem, T_i_j), scans.coarsest),
             lambda: jnp.zeros_like(scans.coarsest),

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Mask, Points, Scalar
 
@@ -154,4 +155,4 @@ def map_first(
 
     first = -(-num // tiles.shape[2])
     start = jnp.zeros((tiles.shape[0], *out.shape), out.dtype)
-    return lax.fori_loop(0, first, one, start)
+    return control.fori_loop(0, first, one, start)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.neighbours.base import AbstractIndex, closest_only, in_tiles, map_first
 from jaxreg.neighbours.order import hilbert_order
@@ -147,7 +148,7 @@ class BoxTree(AbstractIndex):
                 row = jnp.where(stays, row, jnp.where(moves, row_above, rows[at]))
                 return jnp.where(stays, sq, jnp.where(moves, above, new)), row
 
-            return lax.fori_loop(0, _LEAF, insert, found)
+            return control.fori_loop(0, _LEAF, insert, found)
 
         shape = (k, queries.shape[1])
         nothing = (
@@ -180,12 +181,12 @@ class BoxTree(AbstractIndex):
                 return *_next(to_leaves, found[0]), to_leaves, found
 
             start = *_next(to_leaves, found[0]), to_leaves, found
-            found = lax.while_loop(lambda s: s[0], visit_leaf, start)[-1]
+            found = control.while_loop(lambda s: s[0], visit_leaf, start)[-1]
             to_nodes = lax.dynamic_update_index_in_dim(to_nodes, used, node, 0)
             return *_next(to_nodes, found[0]), to_nodes, found
 
         start = *_next(to_nodes, found[0]), to_nodes, found
-        return lax.while_loop(lambda s: s[0], visit_node, start)[-1]
+        return control.while_loop(lambda s: s[0], visit_node, start)[-1]
 
     def _leaf_at(self, point: Float[Array, " d"]) -> Int[Array, ""]:
         """The leaf whose box is closest, in the node whose box is closest."""
@@ -213,7 +214,7 @@ class BoxTree(AbstractIndex):
             jnp.full(leaf.shape, jnp.inf, columns.dtype),
             jnp.zeros(leaf.shape, jnp.int32),
         )
-        lane = lax.fori_loop(0, _LEAF // _UNROLL, part, start)[1]
+        lane = control.fori_loop(0, _LEAF // _UNROLL, part, start)[1]
         return self.leaf_rows[leaf, lane]
 
 
@@ -259,7 +260,7 @@ def _closest_in_leaf(queries: Array, leaf_points: Array, number: Array) -> Array
         return best
 
     start = jnp.full(queries.shape[1], jnp.inf, queries.dtype)
-    return lax.fori_loop(0, _LEAF // _UNROLL, part, start)
+    return control.fori_loop(0, _LEAF // _UNROLL, part, start)
 
 
 def _sq_distance(a: Array, b: Array | list[Array]) -> Array:

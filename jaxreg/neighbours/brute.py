@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.neighbours.base import AbstractIndex, closest_only, map_first
 
@@ -148,12 +149,12 @@ def _closest_group(
                 best = jnp.where(closer, least[at], best)
             return best, number
 
-        return lax.fori_loop(0, least.shape[0] // _UNROLL, pick, state), None
+        return control.fori_loop(0, least.shape[0] // _UNROLL, pick, state), None
 
     n = queries.shape[1]
     start = jnp.full(n, jnp.inf, queries.dtype), jnp.full(n, -1, jnp.int32)
     first = jnp.arange(tiles.shape[0], dtype=jnp.int32) * tiles.shape[1]
-    return lax.scan(visit, start, (first, tiles))[0][1]
+    return control.scan(visit, start, (first, tiles))[0][1]
 
 
 def _closest_in_group(

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.geometry.spacing import median_spacing
 from jaxreg.neighbours.base import AbstractIndex, closest_only, in_tiles, map_first
@@ -112,7 +113,7 @@ class CellGrid(AbstractIndex):
         columns = lax.stop_gradient(columns)
         if coarse is None:
             return self._exactly(columns, num)
-        return lax.cond(
+        return control.cond(
             coarse,
             lambda columns: self._among_some(columns, num),
             lambda columns: self._exactly(columns, num),
@@ -177,7 +178,7 @@ class CellGrid(AbstractIndex):
             return at + _UNROLL, row
 
         start = (jnp.zeros((), jnp.int32), self.table.lookup(queries))
-        return lax.while_loop(lambda state: state[0] <= longest, look, start)[1]
+        return control.while_loop(lambda state: state[0] <= longest, look, start)[1]
 
 
 def _resolution(num_points: int, d: int) -> int:

@@ -19,6 +19,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
+
 
 # Grids of fewer cells along an axis are not halved.
 _COARSEST = 16
@@ -92,7 +94,7 @@ def _closest_in_each_cell(
         row = jax.ops.segment_max(jnp.where(winner, rows, -1), home, cells)
         return jnp.where(row[home] == rows, jnp.inf, sq), jnp.maximum(row, -1)
 
-    found = lax.scan(take, sq, None, candidates)[1]
+    found = control.scan(take, sq, None, candidates)[1]
     return found.reshape(candidates, *(resolution,) * d)
 
 
@@ -121,16 +123,16 @@ def _swept(table: Array, in_cells: Array, times: int) -> Array:
         def sweep(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             lines, coordinates = state
             start = jnp.full(lines.shape[1:], -1, lines.dtype)
-            lines = lax.scan(step, start, (coordinates, lines))[1]
+            lines = control.scan(step, start, (coordinates, lines))[1]
             return lines[::-1], coordinates[::-1]
 
-        lines = lax.fori_loop(0, 2, sweep, (lines, centres))[0]
+        lines = control.fori_loop(0, 2, sweep, (lines, centres))[0]
         grid = lines.reshape(resolution, candidates, resolution, -1)
         grid = jnp.moveaxis(grid, 0, -1)  # (k, second, .., first)
         lines = jnp.moveaxis(grid, 0, 1).reshape(lines.shape)
         return lines, jnp.roll(columns, -1, axis=0)
 
-    lines = lax.fori_loop(0, d * times, along_first, (lines, in_cells.T))[0]
+    lines = control.fori_loop(0, d * times, along_first, (lines, in_cells.T))[0]
     return jnp.moveaxis(lines, 1, 0).reshape(table.shape)
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.adjoint import refusing
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion, Scalar
@@ -207,7 +208,7 @@ def _accurate(
     if not steps or pair.source.fine is None:
         return every
     first = jax.tree.map(lambda x: x[0], every)
-    last = lax.cond(
+    last = control.cond(
         sound[0] & enough,
         lambda first: last_digits(pair, kernel, first[0], width),
         lambda first: first,

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
@@ -175,7 +176,7 @@ class _Drawing(AbstractIteration[Particles, _Draws]):
             return self._phase(which == 1, number, particles)
 
         # One loop compiles the measurement once.
-        particles = lax.fori_loop(0, 2, phase, state.particles)
+        particles = control.fori_loop(0, 2, phase, state.particles)
         settled = particles.rows(slice(self._drawn(particles), None))
         points = jnp.maximum(jnp.sum(self.problem.source_mask), 1)
         points = points.astype(particles.energy.dtype)

@@ -3,9 +3,9 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Scalar
 from jaxreg.local import LocalOptimiser, decoupled_error
 from jaxreg.matching import Problem, match
@@ -50,7 +50,7 @@ def measure(
             width = first * (last / first) ** share.astype(T.dtype)
             return optimiser(problem, T, width)
 
-        T_measured = lax.fori_loop(0, num_steps, step, T)
+        T_measured = control.fori_loop(0, num_steps, step, T)
         error = decoupled_error(T_measured, T)
         return T_measured, error, energy(match(problem, T_measured), last)
 
@@ -60,7 +60,7 @@ def measure(
         return jax.tree.map(lambda all_, new: all_.at[rows].set(new), out, found)
 
     start = (T_predicted, particles.motion_error, particles.energy)
-    found = lax.fori_loop(0, -(-num_rows // batch_size), block, start)
+    found = control.fori_loop(0, -(-num_rows // batch_size), block, start)
     return eqx.tree_at(
         lambda p: (p.T_target_source, p.motion_error, p.energy), particles, found
     )

@@ -1,9 +1,9 @@
 """Distinct poses among particles."""
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
 from jaxreg.particle.state import Particles
@@ -41,7 +41,7 @@ def distinct_modes(
         return free & ~same, (best, jnp.where(jnp.any(free), mass, 0))
 
     free = jnp.isfinite(particles.energy) & (particles.log_weight > -jnp.inf)
-    _, (rows, mass) = lax.scan(pick, free, None, length=num_modes)
+    _, (rows, mass) = control.scan(pick, free, None, length=num_modes)
     return jnp.where(mass > 0, rows, rows[0]).astype(jnp.int32), mass
 
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from jaxreg._core import control
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts
 from jaxreg._core.typing import Key, Motion
@@ -94,7 +95,7 @@ class MultiStart(AbstractSearch):
                 T, _ = carry
                 return (optimiser(problem, T, width), T), None
 
-            T, T_before = lax.scan(step, (T, T), widths)[0]
+            T, T_before = control.scan(step, (T, T), widths)[0]
             return (
                 T,
                 decoupled_error(T, T_before),

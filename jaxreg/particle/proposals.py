@@ -7,9 +7,9 @@ refined with the other modes, and the evidence decides among all.
 """
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core import control
 from jaxreg._core.typing import Scalar
 from jaxreg.cloud import PointCloud
 from jaxreg.features import propose
@@ -57,4 +57,4 @@ def propose_modes(
         none = lie.identity(3, source.points.dtype, (num,))
         return none, jnp.zeros(num, bool)
 
-    return lax.cond(wanted, look, nothing)
+    return control.cond(wanted, look, nothing)

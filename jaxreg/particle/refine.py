@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core import control
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
@@ -86,7 +87,7 @@ def followed(
     """The same poses, those in use with the derivatives of the balance near by."""
 
     def one(mode: tuple[Motion, Bool[Array, ""]]) -> Motion:
-        return lax.cond(
+        return control.cond(
             mode[1],
             lambda T: at_rest(
                 Rest(optimiser=optimiser, problem=problem, width=width, T=T)
@@ -107,6 +108,6 @@ def _of_used(
         T, used = mode
         shapes = jax.eval_shape(function, T)
         zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return lax.cond(used, function, lambda _: zero, T)
+        return control.cond(used, function, lambda _: zero, T)
 
     return lax.map(one, (T, used))

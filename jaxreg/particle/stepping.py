@@ -19,9 +19,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Int
 
+from jaxreg._core import control
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.loop import AbstractIteration, Ended, iterate
 from jaxreg._core.typing import Key, Motion, Scalar
@@ -204,7 +204,7 @@ class Filtering(eqx.Module):
             return filtering.step(jax.random.fold_in(key_steps, time), state)
 
         times = jnp.arange(1, method.num_times + 1)
-        return lax.scan(step, filtering.init(key_init, init), times)
+        return control.scan(step, filtering.init(key_init, init), times)
 
     def terminate(self, state: ParticleState) -> Bool[Array, ""]:
         """Whether no particle's motion error exceeds the tolerance."""

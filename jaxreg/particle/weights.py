@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core import control
 from jaxreg._core.typing import Scalar
 
 
@@ -105,7 +106,7 @@ def _temperature(
         small = size_at(middle, held) < wanted
         return jnp.where(small, middle, cold), jnp.where(small, hot, middle)
 
-    found = lax.fori_loop(0, 24, halve, (unit * 1e-4, unit * 1e3))[1]
+    found = control.fori_loop(0, 24, halve, (unit * 1e-4, unit * 1e3))[1]
     size, slope = jax.jvp(lambda T: size_at(T, held), (found,), (jnp.ones_like(found),))
     near = jnp.abs(size - wanted) < _NEAR * wanted
     solvable = near & (slope * found > _FLAT * size)

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.typing import Progress
+from jaxreg.batching.devices import Devices, map_rows, spread_rows
 from jaxreg.batching.padding import (
     rounded_up,
     stacked,
@@ -45,6 +46,7 @@ def register_batch(
     key: Array | None,
     batch_size: int,
     progress: Progress | None,
+    devices: Devices | None,
 ) -> RegistrationSolution:
     """Of pairs of one size."""
     num = math.prod(batch)
@@ -55,7 +57,7 @@ def register_batch(
 
     every = (*map(flat, pair), None if init is None else flat(init), data)
     tell(progress, _STAGE, 0, num, every)
-    threads = num > 0 and _in_threads(method, every)
+    threads = devices is None and num > 0 and _in_threads(method, every)
     every = _on_host(every) if threads else every
 
     def of_rows(rows: np.ndarray) -> _Pairs:
@@ -64,7 +66,8 @@ def register_batch(
         return jax.tree.map(lambda x: jnp.asarray(x[rows]), every)
 
     group = np.arange(num), of_rows
-    solution = _register_groups(method, [group], impl, threads, batch_size, progress)
+    how = impl, threads, batch_size, progress, devices
+    solution = _register_groups(method, [group], *how)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solution)
 
 
@@ -75,12 +78,13 @@ def register_lists(
     key: Array | None,
     batch_size: int,
     progress: Progress | None,
+    devices: Devices | None,
 ) -> list[RegistrationSolution]:
     """Of each pair of two lists; they are padded to few sizes."""
     sources, targets, source_masks, target_masks = lists
     data, impl = _split(key, len(sources))
     tell(progress, _STAGE, 0, len(sources), lists, init, data)
-    threads = _in_threads(method, (lists, init, data))
+    threads = devices is None and _in_threads(method, (lists, init, data))
     each = _on_host((init, data)) if threads else (init, data)
 
     def group(sizes: np.ndarray, members: np.ndarray) -> _Group:
@@ -100,7 +104,8 @@ def register_lists(
 
     sizes = np.array([[rounded_up(len(x)) for x in xs] for xs in (sources, targets)])
     groups = [group(*same) for same in _of_similar_size(sizes.T)]
-    found = _register_groups(method, groups, impl, threads, batch_size, progress)
+    how = impl, threads, batch_size, progress, devices
+    found = _register_groups(method, groups, *how)
     return unstacked(found, len(sources))
 
 
@@ -138,13 +143,16 @@ def _register_groups(
     threads: bool,
     batch_size: int,
     progress: Progress | None,
+    devices: Devices | None,
 ) -> RegistrationSolution:
     """Group after group, the solutions in the order of the pairs' numbers."""
     parts, done, total = [], 0, sum(len(members) for members, _ in groups)
     for members, of_rows in groups:
 
         def some(rows: np.ndarray, of_rows: Callable = of_rows) -> RegistrationSolution:
-            return _register_rows(method, of_rows(rows), impl, batch_size)
+            pairs = of_rows(rows)
+            pairs = pairs if devices is None else spread_rows(devices, pairs)
+            return _register_rows(method, pairs, impl, batch_size, devices)
 
         rows = np.arange(len(members))
         for part in _over_cores(some, rows, batch_size) if threads else [some(rows)]:
@@ -179,7 +187,11 @@ def _over_cores(
 
 @eqx.filter_jit
 def _register_rows(
-    method: AbstractRegistrar, pairs: _Pairs, impl: Hashable, batch_size: int
+    method: AbstractRegistrar,
+    pairs: _Pairs,
+    impl: Hashable,
+    batch_size: int,
+    devices: Devices | None,
 ) -> RegistrationSolution:
     """One group after another: memory stays bounded."""
 
@@ -190,4 +202,8 @@ def _register_rows(
 
     # Groups of one would be vectorised over an axis of one: conditions become selects.
     size = batch_size if batch_size > 1 else None
-    return lax.map(one, pairs, batch_size=size)
+
+    def some(pairs: _Pairs) -> RegistrationSolution:
+        return lax.map(one, pairs, batch_size=size)
+
+    return some(pairs) if devices is None else map_rows(devices, some, pairs)

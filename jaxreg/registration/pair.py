@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from jaxreg._core import control
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motion
 from jaxreg.cloud import Frames
@@ -23,6 +24,7 @@ from jaxreg.registrar import (
 _DOUBTED = Status.LOW_OVERLAP, Status.AMBIGUOUS, Status.DIVERGED
 
 
+@control.over_devices
 def register_pair(
     method: AbstractRegistrar,
     pair: tuple[Array, ...],

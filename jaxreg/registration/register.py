@@ -6,6 +6,7 @@ from typing import overload
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import AbstractMesh, Mesh
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import (
@@ -20,6 +21,7 @@ from jaxreg._core.checks import (
     is_concrete,
 )
 from jaxreg._core.typing import ArrayLike, Key, Progress
+from jaxreg.batching.devices import chosen_devices
 from jaxreg.batching.padding import (
     check_lists,
     is_list_of_clouds,
@@ -52,6 +54,7 @@ def register(  # pyright: ignore[reportOverlappingOverload]
     target_mask: ArrayLike | None = None,
     batch_size: int = 1,
     progress: Progress | None = None,
+    mesh: Mesh | AbstractMesh | None = None,
 ) -> list[RegistrationSolution]: ...
 
 
@@ -67,6 +70,7 @@ def register(
     target_mask: ArrayLike | None = None,
     batch_size: int = 1,
     progress: Progress | None = None,
+    mesh: Mesh | AbstractMesh | None = None,
 ) -> RegistrationSolution: ...
 
 
@@ -81,6 +85,7 @@ def register(
     target_mask: ArrayLike | None = None,
     batch_size: int = 1,
     progress: Progress | None = None,
+    mesh: Mesh | AbstractMesh | None = None,
 ) -> RegistrationSolution | list[RegistrationSolution]:
     """Registers a source point set to a target, or many pairs of them.
 
@@ -114,6 +119,10 @@ def register(
             side. On a CPU one after another is quickest; memory grows with it.
         progress: called as `progress(stage, done, total)` as some of many pairs are
             done, on an accelerator all of a size; not for one pair, not under `jit`.
+        mesh: a mesh of devices with an axis "pair", over which many pairs are spread;
+            without one they stay where the batch is, by the sharding of its leading
+            axis, or are spread over the mesh around the call (`jax.set_mesh`) if that
+            has an axis "pair". Under `jit` with automatic axes name it.
 
     Returns:
         A `RegistrationSolution`, with leading axes for a batch; for lists a list of
@@ -140,6 +149,13 @@ def register(
         program. Where a list would get more than 2^24 rows more, each pair of sizes
         compiles once.
 
+    Devices:
+        Each registers its own pairs and hears of no other. Bits are the same on any
+        number of devices that get several pairs each; on one device, and with one pair
+        each, XLA rounds some sums otherwise. A number of pairs that is no multiple of
+        the devices is filled up, which costs a copy. `register` also works inside
+        `jax.shard_map`; with its checks (`check_vma`) branches are computed both.
+
     Memory:
         Groups of `batch_size` pairs are registered one after another on each core. On a
         CPU that takes, beyond the inputs, one copy of them and about 10 MB + 900 (n +
@@ -153,6 +169,8 @@ def register(
     check_count(batch_size, "batch_size")
     check_callable(progress, "progress")
     key = None if key is None else check_key(key)
+    devices = chosen_devices(mesh, source)
+    how = batch_size, progress, devices
     masks = source_mask, target_mask
     scaled = isinstance(method, ICP) and method.with_scale
     here = near_origin(source, source_mask, "source")
@@ -163,13 +181,13 @@ def register(
         lists = check_lists(here.points, there.points, *masks)
         batch = (len(lists[0]),)
         init = _check_init(init, batch, lists[0][0], scaled)
-        found = register_lists(method, lists, init, key, batch_size, progress)
+        found = register_lists(method, lists, init, key, *how)
         return [moved_back(sol, here.at(i), there.at(i)) for i, sol in enumerate(found)]
     pair = check_pair(here.points, there.points, *masks)
     batch = pair[0].shape[:-2]
     init = _check_init(init, batch, pair[0], scaled)
     if batch:
-        sol = register_batch(method, batch, pair, init, key, batch_size, progress)
+        sol = register_batch(method, batch, pair, init, key, *how)
     else:
         sol = _register_one(method, _rounded_up(pair), init, key)
     return moved_back(sol, here, there)

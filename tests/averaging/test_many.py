@@ -82,8 +82,8 @@ def test_memory_grows_with_the_batch_that_is_asked_for():
 
     def size(batch_size: int) -> int:
         def run(graph, present, init):
-            keys = None
-            found = many._average_lanes(PLAIN, graph, present, init, keys, batch_size)
+            lanes = graph, present, init, None
+            found = many._average_lanes(PLAIN, lanes, batch_size, None)
             return found.T_world_i
 
         memory = jax.jit(run).lower(*lanes).compile().memory_analysis()

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core import control
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_parts
 from jaxreg._core.typing import Key
@@ -127,7 +128,7 @@ class Correntropy(AbstractAverager):
         blank = jax.eval_shape(lambda: from_width(width))
         blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
         # Not on the driver: what it would carry is a number and whole ends of it.
-        _, _, end = jax.lax.while_loop(
+        _, _, end = control.while_loop(
             lambda tried: (tried[1] < least) & (tried[0] < len(DEVIATIONS)),
             narrower,
             (jnp.asarray(0, jnp.int32), jnp.full_like(least, -jnp.inf), blank),

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core import control
 from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.start.cycles import NEUTRAL
 from jaxreg.geometry import lie
@@ -66,7 +67,7 @@ def confirmed(graph: PoseGraph, closure: Bool[Array, " e"]) -> Bool[Array, " e"]
         return supported | agree | jnp.roll(agree, step)
 
     none = jnp.zeros((graph.num_edges,), bool)
-    supported = jax.lax.fori_loop(1, _NEAR, compared, none)
+    supported = control.fori_loop(1, _NEAR, compared, none)
     return none.at[order].set(supported)
 
 

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core import control
 from jaxreg.averaging.likelihood import DEVIATIONS, prior_odds
 from jaxreg.averaging.measures import length_scale
 from jaxreg.geometry import lie
@@ -71,7 +72,7 @@ def edge_log_odds(graph: PoseGraph) -> Float[Array, "s e"]:
             said = jnp.log1p(trust[via_i] * trust[via_j] * gain)
             return prior + jnp.sum(said, axis=1)
 
-        return jax.lax.fori_loop(0, ROUNDS, gather, prior)
+        return control.fori_loop(0, ROUNDS, gather, prior)
 
     odds = jax.vmap(at_scale)(jnp.asarray(NEUTRAL, prior.dtype))
     return jnp.where(present, odds, -jnp.inf)

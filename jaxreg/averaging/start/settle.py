@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core import control
 from jaxreg.averaging.likelihood import explained
 from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.start.cycles import ROUNDS
@@ -39,4 +40,4 @@ def settled(
         tangent = jax.scipy.linalg.cho_solve((factor, True), rhs)
         return nearby_rotation(product(lie.exp(tangent), T))
 
-    return jax.lax.fori_loop(0, ROUNDS, step, T_world_i)
+    return control.fori_loop(0, ROUNDS, step, T_world_i)

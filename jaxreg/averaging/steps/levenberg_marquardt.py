@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.restarts import ROUNDING
 from jaxreg._core.solver import LinearSolver
@@ -219,7 +220,7 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         kept = (s.cycle.usual > 0) & (s.cycle.moved < _MOVED * self.length)
         inverse = s.cycle.inverse
         if self.linear_solver is None:
-            inverse = jax.lax.cond(kept, lambda: inverse, lambda: multigrid(matrix))
+            inverse = control.cond(kept, lambda: inverse, lambda: multigrid(matrix))
         x, rounds = _tangents(matrix, force, self.linear_solver or inverse)
         T = nearby_rotation(product(lie.exp(x), s.T))
         cost = problem.cost(T)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_positive
 from jaxreg._core.typing import Motion
@@ -82,7 +83,7 @@ class LevenbergMarquardt(AbstractStep):
             return _Trial(damping, after < before, last.tries + 1)
 
         start = lax.stop_gradient(jnp.asarray(self.damping, before.dtype))
-        return lax.while_loop(
+        return control.while_loop(
             lambda s: ~s.falls & (s.tries < self.max_tries),
             attempt,
             _Trial(start / 10, jnp.asarray(False), jnp.zeros((), jnp.int32)),

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_positive
 from jaxreg._core.typing import Key
@@ -133,5 +134,5 @@ def _plan(
     falling = epsilon ** (jnp.arange(1, half + 1) / max(half, 1)).astype(cost.dtype)
     # From the mean cost down, or up to an epsilon above it.
     steps = jnp.concatenate([falling, jnp.full(num_steps - half, epsilon)])
-    f, _ = lax.scan(sweep, jnp.zeros_like(log_weight), steps)
+    f, _ = control.scan(sweep, jnp.zeros_like(log_weight), steps)
     return jnp.exp(shares(f, epsilon))
