@@ -98,8 +98,8 @@ def read_scans(
     Args:
         paths: each is a file as for `read_points`, an NPZ or E57 file of which every
             scan is read, or a folder, of which all point files are read in natural
-            order (`scan2` before `scan10`). Of text files there without numbers, such
-            as a readme, a warning tells that they are skipped.
+            order (`scan2` before `scan10`). Of text files there without points, such
+            as a readme or poses, a warning tells that they are skipped.
 
     Returns:
         Names, made of file names without suffix or NPZ keys and unique, and as many
@@ -150,8 +150,7 @@ def read_named(
 def point_files(path: str | Path) -> list[Path]:
     """The point files of a folder in natural order; a file stands for itself.
 
-    Text files without a row of numbers, such as a readme, are left out, see
-    `prose_files`.
+    Text files of something else, such as a readme, are left out, see `prose_files`.
 
     Raises:
         InputError: if a folder holds no point file.
@@ -169,7 +168,11 @@ def point_files(path: str | Path) -> list[Path]:
 
 
 def prose_files(path: str | Path) -> list[Path]:
-    """The text files of a folder that hold no row of numbers; none of a file.
+    """The text files of a folder that are none of points; none of a file.
+
+    Those that are not rows of numbers, such as a readme, and those that plainly hold
+    poses or a graph. An empty one counts if it ends in `.txt`; with another suffix it may be
+    a scan that was not exported whole.
 
     Raises:
         InputError: if the folder cannot be read.
@@ -177,7 +180,8 @@ def prose_files(path: str | Path) -> list[Path]:
     if not Path(path).is_dir():
         return []
     found = [f for f in _candidates(Path(path)) if _suffix(f) in TEXT]
-    return [f for f in found if not text.has_rows(text_lines(f))]
+    found = [f for f in found if f.stat().st_size or _suffix(f) == ".txt"]
+    return [f for f in found if not text.may_be_points(text_lines(f), f)]
 
 
 def _candidates(folder: Path) -> list[Path]:

@@ -85,13 +85,21 @@ def parse_text(
     return points, layout.fields
 
 
-def has_rows(lines: Iterable[Line]) -> bool:
-    """Whether one of the first lines holds two numbers, or they are no text at all."""
+def may_be_points(lines: Iterable[Line], path: Path) -> bool:
+    """Whether half of the first lines have numbers, not plainly of poses or a graph.
+
+    True also of what is no text at all: the reader says what is wrong.
+    """
     try:
         found, _ = _first_lines(iter(lines))
     except InputError:
-        return True  # the reader says what is wrong
-    return not found or any(_has_numbers(line) for _, line in found)
+        return True
+    try:
+        require_points([line for _, line in found], path)
+    except InputError:
+        return False
+    numbers = sum(_has_numbers(line) for _, line in found)
+    return 0 < len(found) <= 2 * numbers
 
 
 class _Counted:
