@@ -13,8 +13,8 @@ class Status(enum.IntEnum):
 
     >>> import jaxreg as jr
     >>> print(jr.Status(1), "-", jr.Status(1).advice)
-    MAX_STEPS - The steps ran out before the answer stood still. Raise `max_steps` \
-(`average --budget`), or start nearer to the solution.
+    MAX_STEPS - The steps ran out before the answer stood still. Raise `max_steps`, \
+or start nearer to the solution.
     """
 
     CONVERGED = 0
@@ -41,8 +41,8 @@ class Status(enum.IntEnum):
 _ADVICE = {
     Status.CONVERGED: "Converged.",
     Status.MAX_STEPS: (
-        "The steps ran out before the answer stood still. Raise `max_steps` (`average "
-        "--budget`), or start nearer to the solution."
+        "The steps ran out before the answer stood still. Raise `max_steps`, or start "
+        "nearer to the solution."
     ),
     Status.DEGENERATE: (
         "The data leave some direction of the motion free (points on a line or a "
@@ -58,8 +58,8 @@ _ADVICE = {
     ),
     Status.LOW_OVERLAP: (
         "No pose was found at which enough of the two point sets agree. They may not "
-        "overlap; else draw more particles (`num_prior`, `--budget`) or give an "
-        "initial guess (`init`)."
+        "overlap; else draw more particles (`num_prior`) or give an initial guess "
+        "(`init`)."
     ),
     Status.AMBIGUOUS: (
         "Several poses agree about equally well (a symmetric object?), or surfaces "

@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.status import Status
+from jaxreg.app.advice import terminal_advice
 from jaxreg.app.colors import scan_colors
 from jaxreg.app.versions import versions
 from jaxreg.graph.pose_graph import PoseGraph
@@ -50,6 +51,8 @@ class Result:
         weight: `(e,)` final trust, 0 to 1.
         inlier_rmse: `(e,)` in the unit of the scans.
         trace: of the solution, for the page.
+        units: `(v,)` what coordinates of the files were multiplied by, None for one.
+        attempt: whether the poses are shown, but not believed.
     """
 
     names: list[str]
@@ -65,6 +68,8 @@ class Result:
     weight: np.ndarray
     inlier_rmse: np.ndarray
     trace: Any = None
+    units: np.ndarray | None = None
+    attempt: bool = False
 
     @property
     def placed(self) -> np.ndarray:
@@ -79,12 +84,43 @@ class Result:
     @property
     def files(self) -> list[str]:
         """Names of the files of the result, the picture and the page included."""
+        if not self.believed:
+            shown = ["figure.png", "report.html"] if self.to_show() else []
+            return ["result.json", *shown]
         more = [
             file_of(name, k)
             for k in range(1, self.num_components)
             for name in _PER_COMPONENT
         ]
         return ["result.json", *_PER_COMPONENT, "figure.png", "report.html", *more]
+
+    @property
+    def believed(self) -> bool:
+        """Whether two scans are joined."""
+        return int(self.placed.sum()) >= 2
+
+    @property
+    def T_file(self) -> np.ndarray:
+        """`T_world_i` of the coordinates that the files have, in their own units."""
+        out = np.array(self.T_world_i, np.float64)
+        if self.units is not None:
+            out[:, :-1, :-1] *= self.units[:, None, None]
+        return out
+
+    def to_show(self) -> "Result | None":
+        """Itself; where no scans are joined the two that overlap most, if any."""
+        finite = np.isfinite(self.T_i_j).all(axis=(1, 2)) & (self.overlap > 0)
+        if self.believed or self.attempt:
+            return self
+        if not finite.any():
+            return None
+        row = int(np.argmax(np.where(finite, self.overlap, -1)))
+        i, j = self.edges[row]
+        T = np.array(self.T_world_i)
+        T[i], T[j] = np.eye(T.shape[-1]), self.T_i_j[row]
+        component = np.full(len(self.names), -1)
+        component[[i, j]] = 0
+        return replace(self, T_world_i=T, component=component, attempt=True)
 
     def best_pair(self, scan: int) -> int | None:
         """The row of the pair of this scan that overlaps most, None without pairs."""
@@ -118,11 +154,11 @@ def result_document(
         "command": command,
         "seed": seed,
         "status": result.status.name,
-        "advice": result.status.advice,
+        "advice": terminal_advice(result.status),
         "names": result.names,
         "T_world_i": [
             T.tolist() if ok else None
-            for T, ok in zip(result.T_world_i, result.component >= 0, strict=True)
+            for T, ok in zip(result.T_file, result.component >= 0, strict=True)
         ],
         "scans": [_scan_entry(result, i) for i in range(len(result.names))],
         "pairs": [_pair_entry(result, e) for e in range(len(result.edges))],
@@ -151,9 +187,9 @@ def write_result(
     """Writes result.json, poses.tum, graph.g2o and merged.ply into an existing folder.
 
     Components beside the model have files of their own, see `file_of`; scans alone are
-    in result.json only. In poses.tum the timestamp, in graph.g2o the id is the number
-    of the scan. graph.g2o holds the pairs that are trusted, the information being the
-    trust times the identity.
+    in result.json only, as is a result that joins no two of them. In poses.tum the
+    timestamp, in graph.g2o the id is the number of the scan. graph.g2o holds the pairs
+    that are trusted, the information being the trust times the identity.
 
     Raises:
         InputError: if a file cannot be written.
@@ -161,6 +197,8 @@ def write_result(
     """
     folder = Path(folder)
     write_json(folder / "result.json", document)
+    if not result.believed:
+        return
     for k in range(result.num_components):
         member = result.component == k
         points, owner = merge_scans(scans, result.T_world_i, member)
@@ -170,7 +208,7 @@ def write_result(
         graph = _trusted_graph(result, ids)
         # Files keep the digits of float64 whatever the precision of the computation.
         with jax.enable_x64(True):
-            T_world_i = jnp.asarray(result.T_world_i[ids])
+            T_world_i = jnp.asarray(_rigid(result.T_world_i[ids]))
             write_tum(folder / file_of("poses.tum", k), T_world_i, timestamps=ids)
             write_g2o(folder / file_of("graph.g2o", k), graph, T_world_i, ids)
 
@@ -219,7 +257,7 @@ def _scan_entry(result: Result, i: int) -> dict[str, Any]:
         "placed": bool(result.placed[i]),
         "component": int(result.component[i]),
         "status": status.name,
-        "advice": status.advice,
+        "advice": terminal_advice(status),
         "num_points": int(result.num_points[i]),
         "num_dropped": int(result.num_dropped[i]),
         "best_pair": best,
@@ -235,7 +273,13 @@ def _pair_entry(result: Result, e: int, motion: bool = True) -> dict[str, Any]:
         "weight": float(result.weight[e]),
         "inlier_rmse": float(result.inlier_rmse[e]),
     }
-    return {**entry, "T_i_j": result.T_i_j[e].tolist()} if motion else entry
+    if not motion:
+        return entry
+    T = np.array(result.T_i_j[e], np.float64)
+    if result.units is not None:  # between coordinates as the files have them
+        T[:-1] /= result.units[i]
+        T[:-1, :-1] *= result.units[j]
+    return {**entry, "T_i_j": T.tolist()}
 
 
 def _trusted_graph(result: Result, ids: np.ndarray) -> PoseGraph:
@@ -245,10 +289,20 @@ def _trusted_graph(result: Result, ids: np.ndarray) -> PoseGraph:
     keep = (edges >= 0).all(axis=1) & (result.weight > 1e-6)
     return PoseGraph.from_edges(
         edges[keep],
-        result.T_i_j[keep],
+        _rigid(result.T_i_j[keep]),
         num_poses=len(ids),
         weight=result.weight[keep],
     )
+
+
+def _rigid(T: np.ndarray) -> np.ndarray:
+    """Motions without the factor of their rotations, which pose files do not know."""
+    out = np.array(T, np.float64)
+    d = out.shape[-1] - 1
+    size = np.abs(np.linalg.det(out[:, :d, :d])) ** (1 / d)
+    scaled = np.abs(size - 1) > 1e-6
+    out[scaled, :d, :d] /= size[scaled, None, None]
+    return out
 
 
 def _thin(points: np.ndarray, max_points: int) -> np.ndarray:

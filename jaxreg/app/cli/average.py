@@ -8,6 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from jaxreg._core.status import Status
+from jaxreg.app.advice import terminal_advice
 from jaxreg.app.cli import outputs
 from jaxreg.app.cli.options import Average
 from jaxreg.app.cli.runtime import Session, key_of
@@ -125,7 +126,7 @@ def _document(
     poses = np.asarray(sol.T_world_i)
     return {
         "status": status.name,
-        "advice": status.advice,
+        "advice": terminal_advice(status),
         "objective_before": objective[0],
         "objective_after": objective[1],
         "names": ids.tolist(),
@@ -153,7 +154,7 @@ def _show(
         f"of {graph.num_edges} edges trusted, {int(sol.num_steps)} steps."
     )
     if status != Status.CONVERGED:
-        session.console.print(status.advice)
+        session.console.print(terminal_advice(status))
     session.console.print(
         "Objective: sum of kappa |R_j - R_i R_i_j|^2 + tau |t_j - t_i - R_i t_i_j|^2 "
         "(SE-Sync)."

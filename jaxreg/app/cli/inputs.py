@@ -57,8 +57,12 @@ class Scans:
         return moved, np.stack(middles)
 
 
-def load_scans(paths: Sequence[Path]) -> Scans:
+def load_scans(paths: Sequence[Path], units: Sequence[float] | None = None) -> Scans:
     """Reads the scans of a command line and refuses what cannot be registered.
+
+    Args:
+        paths: files, folders, archives.
+        units: a factor for each path, which its coordinates are multiplied by.
 
     Raises:
         InputError: if a file cannot be read, there are fewer than two scans, 2D and 3D
@@ -69,7 +73,7 @@ def load_scans(paths: Sequence[Path]) -> Scans:
     points: list[np.ndarray] = []
     places: list[str] = []
     notes: list[str] = []
-    for path in paths:
+    for path, unit in zip(paths, units or [1.0] * len(paths), strict=True):
         notes += [f"{file}: holds no points, skipped." for file in prose_files(path)]
         found = [
             item
@@ -79,7 +83,7 @@ def load_scans(paths: Sequence[Path]) -> Scans:
         alone = len(found) == 1 and not path.is_dir()
         for name, scan in found:
             names.append(name)
-            points.append(scan.points)
+            points.append(scan.points if unit == 1 else unit * scan.points)
             places.append(str(path) if alone else f"{path} ({name})")
             if scan.step > 1:
                 notes.append(
@@ -121,7 +125,8 @@ def _require_one_unit(scans: Scans) -> None:
         if ratio > OTHER_UNIT or 0 < ratio < 1 / OTHER_UNIT:
             raise InputError(
                 f"{place}: spans {extent:.4g}, the others about {usual:.4g}: is it in "
-                "another unit?\nScale it to the unit of the others, or leave it out."
+                "another unit?\nScale it to the unit of the others (of two scans: "
+                "register --unit mm m), or leave it out."
             )
 
 

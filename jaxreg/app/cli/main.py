@@ -1,7 +1,8 @@
 """Entry point of the command `jaxreg`: parses, dispatches, and speaks of errors.
 
-Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted, 143
-ended by SIGTERM, 129 by SIGHUP, 141 when nobody reads the output any more.
+Exit codes: 0 done, 2 bad input (a message of one or two lines), 3 computed, but the
+answer is not believed (its best attempt is written), 130 interrupted, 143 ended by
+SIGTERM, 129 by SIGHUP, 141 when nobody reads the output any more.
 """
 
 import _thread

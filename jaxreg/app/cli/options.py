@@ -17,6 +17,17 @@ from jaxreg.io.errors import InputError
 Precision: TypeAlias = Literal["float32", "float64"]
 Order: TypeAlias = Literal["any", "sequential"]
 AveragingMethod: TypeAlias = Literal["correntropy", "plain", "weighted"]
+PairMethod: TypeAlias = Literal["filter", "icp", "correlation"]
+Unit: TypeAlias = Literal["mm", "cm", "m", "km", "in", "ft"]
+#: Of each unit in metres.
+UNITS: dict[Unit, float] = {
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "m": 1.0,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +88,45 @@ class Register(SearchOptions):
         tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
     ] = None
     """About where the source's origin is in the target's frame; see --deviation."""
+    init: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar='FILE|"16 NUMBERS"', help_behavior_hint="(default: none)"
+        ),
+    ] = None
+    """A guess: the matrix that maps the source to the target, or a result.json."""
+    method: PairMethod = "filter"
+    """The filter needs no guess; the others go on from one, or from the middles."""
+    scale: bool = False
+    """The source may also grow or shrink; of icp alone."""
+    unit: Annotated[
+        tuple[Unit, Unit] | None,
+        tyro.conf.arg(
+            metavar="SOURCE TARGET", help_behavior_hint="(default: the same)"
+        ),
+    ] = None
+    """Units of both scans: mm, cm, m, km, in, ft; the result has the target's."""
+    max_distance: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: no limit)"),
+    ] = None
+    """Points farther from the target do not count; of icp alone."""
+
+    def check_method(self) -> None:
+        """Refuses options that the method cannot use."""
+        icp = {"--scale": self.scale, "--max-distance": self.max_distance is not None}
+        search = {"--upright": self.upright, "--position": self.position is not None}
+        wrong = icp if self.method != "icp" else {}
+        wrong |= search if self.method != "filter" else {}
+        for option in (name for name, given in wrong.items() if given):
+            needed = "icp" if option in icp else "filter"
+            raise InputError(f"{option}: only with --method {needed}.")
+        if self.init is not None and any(search.values()):
+            raise InputError("--init: takes the place of --upright and --position.")
+        if self.max_distance is not None and not self.max_distance > 0:
+            raise InputError(
+                f"--max-distance {self.max_distance}: wanted a number above zero."
+            )
 
 
 @dataclass(frozen=True)

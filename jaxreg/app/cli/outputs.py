@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from jaxreg._core.status import Status
+from jaxreg.app.advice import terminal_advice
 from jaxreg.app.cli.runtime import Session
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_reconstruction, save_figure, write_report
@@ -19,8 +21,15 @@ from jaxreg.io.errors import MissingExtraError
 from jaxreg.metrics import rotation_errors, translation_errors
 
 
+#: The exit code where a computation ended, and its answer is not believed.
+NOT_BELIEVED = 3
+
+
 def uncentre(
-    T: np.ndarray, to_middle: np.ndarray, from_middle: np.ndarray
+    T: np.ndarray,
+    to_middle: np.ndarray,
+    from_middle: np.ndarray,
+    scaled: bool = False,
 ) -> np.ndarray:
     """Motions between centred scans as motions between the scans themselves.
 
@@ -28,6 +37,7 @@ def uncentre(
         T: `(b, d+1, d+1)` maps one centred frame into another.
         to_middle: `(b, d)` or `(d,)` middle of the scan that it maps to.
         from_middle: `(b, d)` or `(d,)` middle of the scan that it maps from.
+        scaled: whether rotations are times a factor, which they keep.
 
     Returns:
         `(b, d+1, d+1)` float64, the rotations orthonormal to float64; NaN where `T` is
@@ -36,8 +46,10 @@ def uncentre(
     out = np.array(T, dtype=np.float64)
     finite = np.isfinite(out).all(axis=(1, 2))
     out[~finite] = np.eye(out.shape[-1])
-    U, _, Vt = np.linalg.svd(out[:, :-1, :-1])
+    U, sizes, Vt = np.linalg.svd(out[:, :-1, :-1])
     R = U @ Vt
+    if scaled:
+        R *= sizes.mean(axis=1)[:, None, None]
     out[:, :-1, :-1] = R
     turned = np.einsum(
         "bij,bj->bi", R, np.broadcast_to(from_middle, out[:, :-1, -1].shape)
@@ -57,6 +69,8 @@ def write_files(
 ) -> None:
     """Writes all files of a result into the folder of `--out`, or none.
 
+    Where no two scans are joined the picture and the page show the likeliest pair.
+
     Args:
         session: the command.
         result: poses and pairs.
@@ -65,12 +79,14 @@ def write_files(
         modes: other poses of the second of two scans, for the page.
         covariances: `(v, k, k)` of the poses, for the page.
     """
+    shown = result.to_show()
     with result_folder(session.options.out) as staging:
-        with session.timed("write"):
-            figure = draw_reconstruction(
-                scans, result.T_world_i, result.names, result.component
-            )
-            save_figure(staging / "figure.png", figure)
+        if shown is not None:
+            with session.timed("write"):
+                figure = draw_reconstruction(
+                    scans, shown.T_world_i, shown.names, shown.component
+                )
+                save_figure(staging / "figure.png", figure)
         document = result_document(
             result,
             command=session.command,
@@ -79,11 +95,13 @@ def write_files(
             errors=errors,
         )
         write_result(staging, result, scans, document)
+        if shown is None:
+            return
         with page_or_message(session):
             write_report(
                 staging / "report.html",
                 scans,
-                result,
+                shown,
                 modes=modes,
                 covariances=covariances,
                 errors=errors,
@@ -183,7 +201,7 @@ def show_scans(session: Session, result: Result) -> None:
             "other, but not the others: a model of its own."
         )
     if result.status != Status.CONVERGED:
-        session.console.print(result.status.advice)
+        session.console.print(terminal_advice(result.status))
 
 
 def _whereabouts(component: int) -> str:
@@ -207,6 +225,21 @@ def show_errors(session: Session, errors: dict[str, Any]) -> None:
         "mean", f"{errors['mean_e_R']:.5f}", f"{1e3 * errors['mean_e_t']:.3f}"
     )
     session.console.print(table)
+
+
+def tell_failure(session: Session, result: Result, what: str, status: Status) -> int:
+    """Says on standard error that nothing is believed; returns the exit code.
+
+    Args:
+        session: the command.
+        result: whose files are written.
+        what: the scans, for the message.
+        status: why.
+    """
+    page = session.options.out / "report.html"
+    look = f"\nThe best attempt, to look at: {page}" * page.exists()
+    sys.stderr.write(f"jaxreg: {what}.\n{terminal_advice(status)}{look}\n")
+    return NOT_BELIEVED
 
 
 def show_end(session: Session, files: Sequence[str], folder: Path) -> None:

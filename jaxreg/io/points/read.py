@@ -171,8 +171,8 @@ def prose_files(path: str | Path) -> list[Path]:
     """The text files of a folder that are none of points; none of a file.
 
     Those that are not rows of numbers, such as a readme, and those that plainly hold
-    poses or a graph. An empty one counts if it ends in `.txt`; with another suffix it may be
-    a scan that was not exported whole.
+    poses or a graph. An empty one counts if it ends in `.txt`; with another suffix it
+    may be a scan that was not exported whole.
 
     Raises:
         InputError: if the folder cannot be read.
