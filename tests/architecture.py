@@ -29,7 +29,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("io.files",),
     ("io.extras", "io.rows", "io.atomic"),
     ("io.points",),
-    ("io.poses", "io.graphs"),
+    ("io.poses", "io.graphs", "io.moved"),
     ("io",),
     ("__init__",),
     ("testing",),

@@ -112,8 +112,7 @@ def _register(
     """The result, the modes of the posterior, and the covariances of both poses."""
     centred, middles = scans.centred()
     target, source = (x[np.isfinite(x).all(axis=1)] for x in centred)
-    more = {} if init is None else {"init": init}
-    sol = jaxreg.register(source, target, method, key=key, **more)
+    sol = jaxreg.register(source, target, method, key=key, init=init)
     scaled = isinstance(method, jaxreg.ICP) and method.with_scale
     T_target_source = outputs.uncentre(
         np.asarray(sol.T_target_source)[None], middles[0], middles[1], scaled

@@ -39,14 +39,12 @@ def read_e57(
     with reading(path, "E57"):
         size = path.stat().st_size
         with pye57.E57(str(path)) as file:
-            for k in range(file.scan_count):
+            for k, name in enumerate(scan_names(file)):
                 header = file.get_header(k)
                 if header.point_count > 8 * size:  # not a bit each
                     raise ValueError(f"{header.point_count} points in {size} bytes")
                 every = step(max(header.point_count, 1))
                 points = _some_points(pye57, file, header, every)
-                name = _name(header, k)
-                name = f"{name}-{k}" if name in scans else name
                 scans[name] = points, tuple(header.point_fields), every
         if not scans:
             raise ValueError("no scans")
@@ -54,6 +52,15 @@ def read_e57(
         name: (as_points(points, f"{path}:{name}"), fields, every)
         for name, (points, fields, every) in scans.items()
     }
+
+
+def scan_names(file: Any) -> list[str]:
+    """Of the scans of an open file, as `read_e57` calls them."""
+    names: list[str] = []
+    for k in range(file.scan_count):
+        name = _name(file.get_header(k), k)
+        names.append(f"{name}-{k}" if name in names else name)
+    return names
 
 
 def _some_points(pye57: Any, file: Any, header: Any, every: int) -> np.ndarray:

@@ -38,7 +38,7 @@ def parse_ply(
         with path.open("rb") if data is None else io.BytesIO(data) as file:
             header = read_header(file, size)
             before, vertex = header.before_and_vertex()
-            names = _coordinates(vertex)
+            names = coordinates(vertex)
             every = step(max(vertex.num, 1))
             if header.order:
                 columns = _binary_columns(path, data, header, names, every)
@@ -52,7 +52,12 @@ def parse_ply(
     return points, tuple(types), every
 
 
-def _coordinates(vertex: Element) -> list[str]:
+def coordinates(vertex: Element) -> list[str]:
+    """The names of the coordinates of vertices.
+
+    Raises:
+        ValueError: if they have no x and y, or lists in their place.
+    """
     found = {p.name: p for p in vertex.properties}
     names = ["x", "y", "z"] if "z" in found else ["x", "y"]
     missing = [name for name in names if name not in found or found[name].length]

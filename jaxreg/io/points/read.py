@@ -135,12 +135,12 @@ def read_named(
         InputError: as `read_points`.
     """
     bare, key = _split_key(path)
-    if _suffix(bare) not in ARCHIVES:
+    if suffix_of(bare) not in ARCHIVES:
         return {stem(bare): _read_file(bare, max_points)}
     step = every_row if max_points is None else at_most(max_points)
     found = _read_archive(bare, step)
     scans = {name: _thinned(scan, max_points) for name, scan in found.items()}
-    if key is None and len(scans) == 1 and _suffix(bare) == ".e57":
+    if key is None and len(scans) == 1 and suffix_of(bare) == ".e57":
         return {stem(bare): next(iter(scans.values()))}  # scanners name all alike
     if key is not None and key not in scans:
         raise InputError(f"{bare}: has no scan {key}.\nIt holds: {_listing(scans)}.")
@@ -179,8 +179,8 @@ def prose_files(path: str | Path) -> list[Path]:
     """
     if not Path(path).is_dir():
         return []
-    found = [f for f in _candidates(Path(path)) if _suffix(f) in TEXT]
-    found = [f for f in found if f.stat().st_size or _suffix(f) == ".txt"]
+    found = [f for f in _candidates(Path(path)) if suffix_of(f) in TEXT]
+    found = [f for f in found if f.stat().st_size or suffix_of(f) == ".txt"]
     return [f for f in found if not text.may_be_points(text_lines(f), f)]
 
 
@@ -190,7 +190,7 @@ def _candidates(folder: Path) -> list[Path]:
         files = [
             f
             for f in folder.iterdir()
-            if f.is_file() and not f.name.startswith(".") and _suffix(f) in SUFFIXES
+            if f.is_file() and not f.name.startswith(".") and suffix_of(f) in SUFFIXES
         ]
     return sorted(files, key=lambda f: _natural(f.name))
 
@@ -206,8 +206,8 @@ def stem(path: str | Path) -> str:
 
 
 def _read_file(path: Path, max_points: int | None) -> NamedPoints:
-    suffix = _suffix(path)
-    _require_known(path, suffix)
+    suffix = suffix_of(path)
+    require_known(path, suffix)
     if suffix in TEXT:
         # Of packed text always: it is unpacked in no time, but parsed in much.
         step = text_step(path) if max_points is not None or is_packed(path) else 1
@@ -230,14 +230,14 @@ def _thinned(scan: NamedPoints, max_points: int | None) -> NamedPoints:
 
 
 def _read_archive(path: Path, step: Step) -> dict[str, NamedPoints]:
-    suffix = _suffix(path)
-    _require_known(path, suffix)
+    suffix = suffix_of(path)
+    require_known(path, suffix)
     with reading(path, suffix[1:].upper()):
         found = _ARCHIVE_READERS[suffix](path, step)
     return {name: NamedPoints(*scan) for name, scan in found.items()}
 
 
-def _require_known(path: Path, suffix: str) -> None:
+def require_known(path: Path, suffix: str) -> None:
     """Refuses what is no file of points before it is read.
 
     Raises:
@@ -269,7 +269,8 @@ def _split_key(path: str | Path) -> tuple[Path, str | None]:
     return (Path(match[1]), match[2]) if match else (Path(path), None)
 
 
-def _suffix(path: Path) -> str:
+def suffix_of(path: Path) -> str:
+    """In lower case, that within of a packed file: `.ply` of `A.PLY.gz`."""
     name = path.name.lower()
     packed = name.endswith(".gz")
     suffix = Path(name[:-3] if packed else name).suffix

@@ -27,7 +27,7 @@ _LOOK = 50  # rows that the layout is read from
 Line = tuple[int, str]
 
 
-class _Layout(NamedTuple):
+class Layout(NamedTuple):
     """What the first lines say.
 
     Attributes:
@@ -85,6 +85,16 @@ def parse_text(
     return points, layout.fields
 
 
+def rows_from(lines: Iterable[Line], path: Path) -> tuple[Layout, int, list[str]]:
+    """The layout of a text file, the number of its first row, and the first rows.
+
+    Raises:
+        InputError: as `parse_text`.
+    """
+    layout, rows = _layout(*_first_lines(iter(lines)), path)
+    return layout, rows[0][0], [line for _, line in rows]
+
+
 def may_be_points(lines: Iterable[Line], path: Path) -> bool:
     """Whether half of the first lines have numbers, not plainly of poses or a graph.
 
@@ -135,7 +145,7 @@ def _first_lines(lines: Iterator[Line]) -> tuple[list[Line], list[str]]:
 
 def _layout(
     lines: list[Line], heads: list[str], path: Path
-) -> tuple[_Layout, list[Line]]:
+) -> tuple[Layout, list[Line]]:
     """What the lines say, and those that are rows."""
     require_points([line for _, line in lines], path)
     count: int | None = None
@@ -168,7 +178,7 @@ def _layout(
     columns, fields = coordinates(names, numeric, len(rows[0]), path)
     _require_first_row(rows, columns, lines, path)
     needed = max(numeric) + 1
-    return _Layout(dialect, columns, fields, len(rows[0]), needed, count), lines
+    return Layout(dialect, columns, fields, len(rows[0]), needed, count), lines
 
 
 def _has_numbers(line: str) -> bool:
@@ -206,7 +216,7 @@ def _require_first_row(
             )
 
 
-def _parse_row(line: Line, layout: _Layout, path: Path) -> list[float]:
+def _parse_row(line: Line, layout: Layout, path: Path) -> list[float]:
     number, text = line
     cells = layout.dialect.cells(text)
     try:
@@ -223,7 +233,7 @@ def _parse_row(line: Line, layout: _Layout, path: Path) -> list[float]:
         ) from err
 
 
-def _require_width(cells: list[str], layout: _Layout) -> None:
+def _require_width(cells: list[str], layout: Layout) -> None:
     """Rows may differ in words behind the numbers, not in numbers.
 
     Raises:
