@@ -18,17 +18,15 @@ import numpy as np
 
 from jaxreg._core.status import Status
 from jaxreg.app.advice import terminal_advice
-from jaxreg.app.colors import scan_colors
+from jaxreg.app.merge import Look, write_merged
 from jaxreg.app.versions import versions
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.graphs.g2o import write_g2o
-from jaxreg.io.points.write_ply import write_ply
 from jaxreg.io.poses.tum import write_tum
 
 
 _ROW = re.compile(r"\[[-+.,\d\seE]*\]")
-MAX_MERGED_POINTS = 2_000_000
 _PER_COMPONENT = ("poses.tum", "graph.g2o", "merged.ply")
 
 
@@ -53,6 +51,7 @@ class Result:
         trace: of the solution, for the page.
         units: `(v,)` what coordinates of the files were multiplied by, None for one.
         attempt: whether the poses are shown, but not believed.
+        aligned: files of whole scans in the common frame.
     """
 
     names: list[str]
@@ -70,6 +69,7 @@ class Result:
     trace: Any = None
     units: np.ndarray | None = None
     attempt: bool = False
+    aligned: tuple[str, ...] = ()
 
     @property
     def placed(self) -> np.ndarray:
@@ -92,7 +92,14 @@ class Result:
             for k in range(1, self.num_components)
             for name in _PER_COMPONENT
         ]
-        return ["result.json", *_PER_COMPONENT, "figure.png", "report.html", *more]
+        return [
+            "result.json",
+            *_PER_COMPONENT,
+            "figure.png",
+            "report.html",
+            *more,
+            *self.aligned,
+        ]
 
     @property
     def believed(self) -> bool:
@@ -183,6 +190,7 @@ def write_result(
     result: Result,
     scans: Sequence[np.ndarray],
     document: dict[str, Any],
+    look: Look | None = None,
 ) -> None:
     """Writes result.json, poses.tum, graph.g2o and merged.ply into an existing folder.
 
@@ -201,9 +209,8 @@ def write_result(
         return
     for k in range(result.num_components):
         member = result.component == k
-        points, owner = merge_scans(scans, result.T_world_i, member)
-        colors = scan_colors(len(scans))[owner]
-        write_ply(folder / file_of("merged.ply", k), points, colors)
+        model = folder / file_of("merged.ply", k)
+        write_merged(model, scans, result.T_world_i, member, look)
         ids = np.flatnonzero(member)
         graph = _trusted_graph(result, ids)
         # Files keep the digits of float64 whatever the precision of the computation.
@@ -217,35 +224,6 @@ def file_of(name: str, component: int) -> str:
     """The name of a component's file: merged.ply, merged_1.ply, ..."""
     stem, _, suffix = name.rpartition(".")
     return f"{stem}_{component}.{suffix}" if component else name
-
-
-def merge_scans(
-    scans: Sequence[np.ndarray],
-    T_world_i: np.ndarray,
-    placed: np.ndarray,
-    max_points: int = MAX_MERGED_POINTS,
-) -> tuple[np.ndarray, np.ndarray]:
-    """All placed scans in the common frame.
-
-    Above `max_points` one point per cube is kept, the cubes being as small as that
-    number allows within a factor of 1.25.
-
-    Returns:
-        `(n, d)` points, float32 if all scans are, else float64, and `(n,)` the scan
-        that each comes from. Rows with NaN or inf are left out.
-    """
-    parts, owner = [], []
-    for k, (scan, T) in enumerate(zip(scans, T_world_i, strict=True)):
-        if placed[k]:
-            finite = scan[np.isfinite(scan).all(axis=1)].astype(np.float64)
-            parts.append(finite @ T[:-1, :-1].T + T[:-1, -1])
-            owner.append(np.full(len(finite), k))
-    points, owners = np.concatenate(parts), np.concatenate(owner)
-    if len(points) > max_points:
-        keep = _thin(points, max_points)
-        points, owners = points[keep], owners[keep]
-    narrow = all(s.dtype == np.float32 for s in scans)
-    return points.astype(np.float32 if narrow else np.float64), owners
 
 
 def _scan_entry(result: Result, i: int) -> dict[str, Any]:
@@ -303,19 +281,6 @@ def _rigid(T: np.ndarray) -> np.ndarray:
     scaled = np.abs(size - 1) > 1e-6
     out[scaled, :d, :d] /= size[scaled, None, None]
     return out
-
-
-def _thin(points: np.ndarray, max_points: int) -> np.ndarray:
-    low = points.min(axis=0)
-    extent = float(np.ptp(points, axis=0).max())
-    size = extent / 4096
-    while True:
-        cell = ((points - low) / size).astype(np.int64)
-        strides = np.cumprod([1, *(cell.max(axis=0)[:-1] + 1)])
-        _, first = np.unique(cell @ strides, return_index=True)
-        if len(first) <= max_points:
-            return np.sort(first)
-        size *= 1.25
 
 
 def without_nan(value: Any) -> Any:

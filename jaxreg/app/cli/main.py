@@ -125,7 +125,7 @@ def _run(arguments: list[str]) -> int:
         os.environ["PYTHON_TYRO_BACKEND"] = "argparse"
     import tyro
 
-    from jaxreg.app.cli.options import COMMANDS, Info
+    from jaxreg.app.cli.options import COMMANDS, Options
 
     command = tyro.cli(
         COMMANDS,
@@ -139,7 +139,7 @@ def _run(arguments: list[str]) -> int:
     )
     # What a command needs is imported when it is known which one it is.
     module = import_module(f"jaxreg.app.cli.{type(command).__name__.lower()}")
-    if isinstance(command, Info):
+    if not isinstance(command, Options):
         return module.run(command)
     from jaxreg.app.cli import runtime
 

@@ -27,6 +27,7 @@ def run(command: Multiview, session: Session) -> int:
     with session.timed("read"):
         if not command.scans:
             raise InputError("No scans given.\nUsage: jaxreg multiview SCAN SCAN ...")
+        command.check_model()
         scans = load_scans(command.scans)
         command.check_known(scans.points[0].shape[1])
         _check_viewpoint(command.viewpoint, scans)
@@ -179,7 +180,7 @@ def report(
     session: Session, result: Result, scans: Scans, errors: dict[str, Any] | None
 ) -> int:
     """Writes the files and prints the tables; returns the exit code."""
-    outputs.write_files(session, result, scans.points, errors)
+    result = outputs.write_files(session, result, scans.points, errors, read=scans)
     outputs.show_scans(session, result)
     if not result.believed:
         return _tell_none_joined(session, result, scans)

@@ -18,6 +18,7 @@ Precision: TypeAlias = Literal["float32", "float64"]
 Order: TypeAlias = Literal["any", "sequential"]
 AveragingMethod: TypeAlias = Literal["correntropy", "plain", "weighted"]
 PairMethod: TypeAlias = Literal["filter", "icp", "correlation"]
+Color: TypeAlias = Literal["scan", "own"]
 Unit: TypeAlias = Literal["mm", "cm", "m", "km", "in", "ft"]
 #: Of each unit in metres.
 UNITS: dict[Unit, float] = {
@@ -69,13 +70,33 @@ class SearchOptions(Options):
             )
 
 
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(SearchOptions):
+    """Options of the commands that write scans from files in one frame."""
+
+    save_aligned: bool = False
+    """Write each scan whole in the common frame, too: its format, all it holds."""
+    color: Color = "scan"
+    """Of merged.ply: one for each scan, or the scans' own where they have them."""
+    voxel: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: by size)"),
+    ] = None
+    """Edge of cubes of which merged.ply has one point each; else two million points."""
+
+    def check_model(self) -> None:
+        """Requires an edge above zero."""
+        if self.voxel is not None and not 0 < self.voxel < math.inf:
+            raise InputError(f"--voxel {self.voxel}: wanted a number above zero.")
+
+
 @dataclass(frozen=True)
 class Demo(SearchOptions):
     """Scan a sculpture from twelve views, reconstruct it, compare to the truth."""
 
 
 @dataclass(frozen=True)
-class Register(SearchOptions):
+class Register(ModelOptions):
     """Move one scan onto another, without an initial guess."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
@@ -130,7 +151,7 @@ class Register(SearchOptions):
 
 
 @dataclass(frozen=True)
-class Multiview(SearchOptions):
+class Multiview(ModelOptions):
     """Bring scans into one frame, without an initial guess."""
 
     scans: Annotated[
@@ -179,6 +200,25 @@ class Average(Options):
 
 
 @dataclass(frozen=True)
+class Apply:
+    """Move scans by poses that are written already, whole and in their formats."""
+
+    poses: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="POSES")]
+    """A result.json, or poses as TUM, KITTI, g2o, .conf, .log, one 4 x 4 matrix."""
+    scans: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="SCAN ...", help_behavior_hint="(required)"),
+    ]
+    """Files, folders or archives of scans, in the order of poses without names."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("jaxreg-aligned")
+    """For the moved scans; made if needed."""
+    inverse: bool = False
+    """The poses map the world to the scans; move by their inverses."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+@dataclass(frozen=True)
 class Info:
     """Tell what files of scans or pose graphs hold."""
 
@@ -196,5 +236,6 @@ COMMANDS = (
     | Annotated[Register, tyro.conf.subcommand("register")]
     | Annotated[Multiview, tyro.conf.subcommand("multiview")]
     | Annotated[Average, tyro.conf.subcommand("average")]
+    | Annotated[Apply, tyro.conf.subcommand("apply")]
     | Annotated[Info, tyro.conf.subcommand("info")]
 )

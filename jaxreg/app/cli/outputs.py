@@ -13,6 +13,9 @@ from rich.table import Table
 
 from jaxreg._core.status import Status
 from jaxreg.app.advice import terminal_advice
+from jaxreg.app.aligned import write_aligned
+from jaxreg.app.cli.inputs import Scans, look_of
+from jaxreg.app.cli.options import ModelOptions
 from jaxreg.app.cli.runtime import Session
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_reconstruction, save_figure, write_report
@@ -66,7 +69,8 @@ def write_files(
     errors: dict[str, Any] | None = None,
     modes: tuple[np.ndarray, ...] | None = None,
     covariances: np.ndarray | None = None,
-) -> None:
+    read: Scans | None = None,
+) -> Result:
     """Writes all files of a result into the folder of `--out`, or none.
 
     Where no two scans are joined the picture and the page show the likeliest pair.
@@ -78,6 +82,10 @@ def write_files(
         errors: against a known truth, see `pose_errors`.
         modes: other poses of the second of two scans, for the page.
         covariances: `(v, k, k)` of the poses, for the page.
+        read: where the scans are whole, if they are files.
+
+    Returns:
+        The result, which knows the files of whole scans.
     """
     shown = result.to_show()
     with result_folder(session.options.out) as staging:
@@ -87,6 +95,11 @@ def write_files(
                     scans, shown.T_world_i, shown.names, shown.component
                 )
                 save_figure(staging / "figure.png", figure)
+        look = None
+        if isinstance(session.options, ModelOptions) and read is not None:
+            with session.timed("write"):
+                look = look_of(read, session.options) if result.believed else None
+                result = _with_aligned(session.options, staging, result, read)
         document = result_document(
             result,
             command=session.command,
@@ -94,9 +107,9 @@ def write_files(
             times={k: round(v, 3) for k, v in session.times.items()},
             errors=errors,
         )
-        write_result(staging, result, scans, document)
+        write_result(staging, result, scans, document, look)
         if shown is None:
-            return
+            return result
         with page_or_message(session):
             write_report(
                 staging / "report.html",
@@ -107,6 +120,24 @@ def write_files(
                 errors=errors,
                 details=page_details(session, document),
             )
+    return result
+
+
+def _with_aligned(
+    options: ModelOptions, staging: Path, result: Result, read: Scans
+) -> Result:
+    """The result, its scans written whole: folders aligned, aligned_1, ..."""
+    if not (options.save_aligned and result.believed):
+        return result
+    names: list[str] = []
+    for k in range(result.num_components):
+        ids = np.flatnonzero(result.component == k)
+        folder = staging / (f"aligned_{k}" if k else "aligned")
+        folder.mkdir()
+        motions = {int(i): result.T_file[i] for i in ids}
+        written = write_aligned(folder, read.files, motions)
+        names += [f"{folder.name}/{name}" for name in written]
+    return dataclasses.replace(result, aligned=tuple(names))
 
 
 @contextlib.contextmanager
@@ -245,6 +276,9 @@ def tell_failure(session: Session, result: Result, what: str, status: Status) ->
 def show_end(session: Session, files: Sequence[str], folder: Path) -> None:
     """Prints what took how long and what was written, of the files there may be."""
     files = [name for name in files if (folder / name).exists()]
+    whole = [name.partition("/")[0] for name in files if "/" in name]
+    files = [name for name in files if "/" not in name]
+    files += [f"{name}/ ({whole.count(name)} files)" for name in dict.fromkeys(whole)]
     parts = ", ".join(f"{name} {s:.1f} s" for name, s in session.times.items())
     session.console.print(f"Times: {parts}.")
     session.console.print(f"Written to {folder}: {', '.join(files)}.")

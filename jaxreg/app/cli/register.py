@@ -22,6 +22,7 @@ from jaxreg.io.errors import InputError
 def run(command: Register, session: Session) -> int:
     """Runs the command; returns the exit code."""
     command.check_method()
+    command.check_model()
     units = _units(command)
     with session.timed("read"):
         scans = load_scans([command.target, command.source], units)
@@ -42,8 +43,13 @@ def run(command: Register, session: Session) -> int:
         result, modes, covariances = _register(scans, key, method, init)
         progress("registering", 1, 1)
     result = dataclasses.replace(result, units=np.asarray(units))
-    outputs.write_files(
-        session, result, scans.points, modes=modes, covariances=covariances
+    result = outputs.write_files(
+        session,
+        result,
+        scans.points,
+        modes=modes,
+        covariances=covariances,
+        read=scans,
     )
     if not result.believed:
         who = f"{command.source} onto {command.target}: {result.status.name}"

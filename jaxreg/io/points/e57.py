@@ -63,6 +63,26 @@ def scan_names(file: Any) -> list[str]:
     return names
 
 
+def read_columns(
+    path: Path, key: str | None, names: list[str], every: int
+) -> list[np.ndarray]:
+    """Fields of one of so many points of a scan, the first one without a name."""
+    pye57 = require("pye57", "Reading E57")
+    parts, found = [], 0
+    with pye57.E57(str(path)) as file:
+        known = scan_names(file)
+        header = file.get_header(known.index(key) if key in known else 0)
+        flags = [f for f in header.point_fields if f.endswith("InvalidState")]
+        data, buffers = file.make_buffers([*names, *flags[:1]], _CHUNK)
+        chunks = header.points.reader(buffers)
+        while count := chunks.read():
+            rows = slice(-found % every, count, every)
+            found += count
+            valid = data[flags[0]][rows] == 0 if flags else slice(None)
+            parts.append([data[name][rows][valid].copy() for name in names])
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+
 def _some_points(pye57: Any, file: Any, header: Any, every: int) -> np.ndarray:
     """As `pye57.E57.read_scan` has them, but unpacked by chunks."""
     system = header.get_coordinate_system(pye57.e57.COORDINATE_SYSTEMS)

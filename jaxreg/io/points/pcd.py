@@ -55,6 +55,16 @@ def parse_pcd(
     return as_points(np.stack(columns, axis=1), str(path)), fields, every
 
 
+def read_columns(
+    data: bytes | None, path: Path, names: list[str], every: int
+) -> list[np.ndarray]:
+    """Fields of one of so many points, in their types."""
+    pypcd4 = require("pypcd4", "Reading PCD")
+    with path.open("rb") if data is None else io.BytesIO(data) as file:
+        header = pypcd4.MetaData.parse_header(header_lines(file))
+        return _columns(pypcd4, file, header, names, every)
+
+
 def header_lines(file: Any) -> list[str]:
     """Its lines; the data begin after them."""
     lines: list[str] = []

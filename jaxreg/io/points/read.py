@@ -80,7 +80,7 @@ def read_points(path: str | Path) -> np.ndarray:
         MissingExtraError: if the package of the extra `formats` that reads this kind is
             not installed.
     """
-    bare, key = _split_key(path)
+    bare, key = split_key(path)
     scans = read_named(path)
     if len(scans) > 1:
         raise InputError(
@@ -134,7 +134,7 @@ def read_named(
     Raises:
         InputError: as `read_points`.
     """
-    bare, key = _split_key(path)
+    bare, key = split_key(path)
     if suffix_of(bare) not in ARCHIVES:
         return {stem(bare): _read_file(bare, max_points)}
     step = every_row if max_points is None else at_most(max_points)
@@ -264,7 +264,8 @@ def _unpacked(path: Path) -> bytes:
         return file.read()
 
 
-def _split_key(path: str | Path) -> tuple[Path, str | None]:
+def split_key(path: str | Path) -> tuple[Path, str | None]:
+    """The file and the key of `FILE.npz:KEY`; None without one."""
     match = re.fullmatch(r"(.*\.(?:npz|e57)):([^/\\]+)", str(path), re.IGNORECASE)
     return (Path(match[1]), match[2]) if match else (Path(path), None)
 

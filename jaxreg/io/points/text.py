@@ -5,7 +5,7 @@ file nor what to do.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,6 +110,19 @@ def may_be_points(lines: Iterable[Line], path: Path) -> bool:
         return False
     numbers = sum(_has_numbers(line) for _, line in found)
     return 0 < len(found) <= 2 * numbers
+
+
+def parse_columns(
+    lines: Iterable[Line], path: Path, names: Sequence[str], step: int
+) -> np.ndarray:
+    """The columns of these names, `(n, k)` float64, of one of so many rows."""
+    lines = iter(lines)
+    layout, first = _layout(*_first_lines(lines), path)
+    layout = layout._replace(columns=[layout.fields.index(name) for name in names])
+    rest = (line for line in lines if line[1].strip() and not is_comment(line[1]))
+    kept = itertools.islice(itertools.chain(first, rest), 0, None, step)
+    rows = [_parse_row(line, layout, path) for line in kept]
+    return np.array(rows, np.float64).reshape(-1, len(names))
 
 
 class _Counted:
