@@ -17,6 +17,7 @@ from jaxreg.io.errors import InputError
 Precision: TypeAlias = Literal["float32", "float64"]
 Order: TypeAlias = Literal["any", "sequential"]
 AveragingMethod: TypeAlias = Literal["correntropy", "plain", "weighted"]
+Align: TypeAlias = Literal["first", "best", "positions", "none"]
 PairMethod: TypeAlias = Literal["filter", "icp", "correlation"]
 Color: TypeAlias = Literal["scan", "own"]
 Unit: TypeAlias = Literal["mm", "cm", "m", "km", "in", "ft"]
@@ -219,6 +220,32 @@ class Apply:
 
 
 @dataclass(frozen=True)
+class Evaluate:
+    """Compare poses, or motions of pairs, with true ones."""
+
+    estimate: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ESTIMATE")]
+    """A result.json, or poses as TUM, KITTI, g2o, .conf, .log; or a .log of pairs."""
+    truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")]
+    """The same; beside a .log of pairs its .info tells the registration recall."""
+
+    align: Align = "first"
+    """Frames first agree in this: the first pose, rotations (best), positions, none."""
+    delta: int = 1
+    """Frames between the two of a relative error."""
+    max_difference: float = 0.01
+    """Of two timestamps, in seconds, that count as one."""
+    threshold: float = 0.2
+    """Distance of coinciding points, up to which the motion of a pair is right."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: none)"),
+    ] = None
+    """For evaluation.json and evaluation.png; made if needed."""
+    json: bool = False
+    """Print one JSON object instead."""
+
+
+@dataclass(frozen=True)
 class Info:
     """Tell what files of scans or pose graphs hold."""
 
@@ -237,5 +264,6 @@ COMMANDS = (
     | Annotated[Multiview, tyro.conf.subcommand("multiview")]
     | Annotated[Average, tyro.conf.subcommand("average")]
     | Annotated[Apply, tyro.conf.subcommand("apply")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Info, tyro.conf.subcommand("info")]
 )
