@@ -6,6 +6,9 @@ happened and what to change.
 """
 
 import enum
+from typing import Any
+
+import numpy as np
 
 
 class Status(enum.IntEnum):
@@ -36,6 +39,13 @@ or start nearer to the solution.
     def advice(self) -> str:
         """What happened, why that is likely, and what to change."""
         return _ADVICE[self]
+
+
+def counted(status: Any) -> str:
+    """How many of a batch have each status: "CONVERGED 990, LOW_OVERLAP 10"."""
+    values, counts = np.unique(np.asarray(status), return_counts=True)
+    told = zip(values.tolist(), counts.tolist(), strict=True)
+    return ", ".join(f"{Status(int(value)).name} {num}" for value, num in told)
 
 
 _ADVICE = {

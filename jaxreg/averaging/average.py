@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import overload
 
 from jaxreg._core.checks import check_callable, check_count, check_key, check_method
+from jaxreg._core.log import log_solution
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
@@ -107,4 +108,6 @@ def average(
     if isinstance(graph, list | tuple):
         return average_list(graph, method, init, key, batch_size, progress)
     one = check_graph(graph, "graph")
-    return average_graph(one, method, check_init(init, one, "init"), key)
+    solution = average_graph(one, method, check_init(init, one, "init"), key)
+    log_solution("average", solution)
+    return solution

@@ -19,6 +19,7 @@ from jaxreg._core.checks import (
     check_rigid,
     is_concrete,
 )
+from jaxreg._core.log import log_solution
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.batching.padding import (
     check_lists,
@@ -172,7 +173,9 @@ def register(
         sol = register_batch(method, batch, pair, init, key, batch_size, progress)
     else:
         sol = _register_one(method, _rounded_up(pair), init, key)
-    return moved_back(sol, here, there)
+    sol = moved_back(sol, here, there)
+    log_solution("register", sol)
+    return sol
 
 
 def _check_init(
