@@ -25,7 +25,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("registration", "averaging.methods"),
     ("averaging",),
     ("multiview",),
-    ("io.errors", "io.quaternions"),
+    ("io.errors", "io.printable", "io.quaternions"),
     ("io.files",),
     ("io.extras", "io.rows", "io.atomic"),
     ("io.points",),

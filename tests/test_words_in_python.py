@@ -1,4 +1,4 @@
-"""What Python tells: reprs of batches, messages on other libraries' objects, the log."""
+"""What Python tells: reprs of batches, words on other libraries' objects, the log."""
 
 import logging
 

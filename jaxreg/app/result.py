@@ -27,6 +27,8 @@ from jaxreg.io.poses.tum import write_tum
 
 
 _ROW = re.compile(r"\[[-+.,\d\seE]*\]")
+#: Described by result.schema.json beside this file; a new number where keys change.
+RESULT_FORMAT = "jaxreg result 1"
 _PER_COMPONENT = ("poses.tum", "graph.g2o", "merged.ply")
 
 
@@ -158,6 +160,7 @@ def result_document(
         errors: against a known truth, or None.
     """
     document = {
+        "format": RESULT_FORMAT,
         "command": command,
         "seed": seed,
         "status": result.status.name,

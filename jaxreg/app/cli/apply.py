@@ -11,6 +11,7 @@ from jaxreg.app.folder import held
 from jaxreg.app.trajectories import Trajectory, read_trajectory
 from jaxreg.io.atomic import atomic_folder
 from jaxreg.io.errors import InputError
+from jaxreg.io.printable import printable
 
 
 def run(command: Apply) -> int:
@@ -28,7 +29,7 @@ def run(command: Apply) -> int:
         left = [scan.name for k, scan in enumerate(scans) if k not in motions]
         lines = [f"{name}: has no pose, left out." for name in left]
         lines.append(f"Written to {command.out}: {', '.join(written)}.")
-        sys.stdout.write("\n".join(lines) + "\n")
+        sys.stdout.write(printable("\n".join(lines)) + "\n")
     return 0
 
 

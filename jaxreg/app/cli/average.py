@@ -1,6 +1,7 @@
 """`jaxreg average`: poses from the relative motions of a g2o file."""
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ from jaxreg.app.cli.options import Average
 from jaxreg.app.cli.runtime import Session, key_of
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_graph, save_figure, write_graph_report
-from jaxreg.app.result import write_json
+from jaxreg.app.result import RESULT_FORMAT, write_json
 from jaxreg.app.versions import versions
 from jaxreg.averaging import (
     AveragingSolution,
@@ -27,6 +28,7 @@ from jaxreg.averaging import (
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.errors import InputError
 from jaxreg.io.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
+from jaxreg.io.graphs.redwood import read_log
 from jaxreg.io.poses.tum import write_tum
 from jaxreg.metrics import chordal_objective
 
@@ -47,8 +49,7 @@ def run(command: Average, session: Session) -> int:
     method = METHODS[command.method](**steps)
     with session.timed("read"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        graph = read_g2o(command.graph)
-        ids, _ = read_g2o_poses(command.graph)
+        graph, ids = _read(command.graph)
     for message in {str(w.message) for w in caught}:
         session.console.print(message)
     key = key_of(command)
@@ -64,6 +65,15 @@ def run(command: Average, session: Session) -> int:
     _show(session, graph, sol, objective)
     outputs.show_end(session, FILES, command.out)
     return 0
+
+
+def _read(path: Path) -> tuple[PoseGraph, np.ndarray]:
+    """The motions, and what the file calls the frames."""
+    if path.suffix.lower() == ".log":
+        graph = read_log(path)
+        return graph, np.arange(graph.num_poses)
+    ids, _ = read_g2o_poses(path)
+    return read_g2o(path), ids
 
 
 def _write(
@@ -125,6 +135,7 @@ def _document(
     status = Status(int(sol.status))
     poses = np.asarray(sol.T_world_i)
     return {
+        "format": RESULT_FORMAT,
         "status": status.name,
         "advice": terminal_advice(status),
         "objective_before": objective[0],

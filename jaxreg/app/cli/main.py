@@ -21,6 +21,7 @@ from typing import NoReturn
 from jaxreg.app.folder import held
 from jaxreg.app.versions import version
 from jaxreg.io.errors import InputError, MissingExtraError
+from jaxreg.io.printable import printable
 
 
 _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
@@ -88,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()  # what is not written now would fail behind Python's end
         return code
     except (InputError, MissingExtraError) as err:
-        sys.stderr.write(f"jaxreg: {err}\n")
+        sys.stderr.write(f"jaxreg: {printable(str(err))}\n")
         return 2
     except BrokenPipeError:  # as in `jaxreg ... | head`: nobody reads on
         _drop_output()
@@ -96,7 +97,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as err:
         where = f"{err.filename}: " if err.filename else ""
         sys.stderr.write(
-            f"jaxreg: {where}{err.strerror or err}; no results were written.\n"
+            f"jaxreg: {printable(where)}{err.strerror or err}; no results were "
+            "written.\n"
         )
         _drop_output()
         return 2

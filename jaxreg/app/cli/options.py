@@ -185,8 +185,8 @@ class Multiview(ModelOptions):
 class Average(Options):
     """Find poses that agree with the relative motions of a pose graph."""
 
-    graph: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GRAPH.g2o")]
-    """A g2o file; its vertices are not used, the answer comes from its edges alone."""
+    graph: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GRAPH")]
+    """Motions of pairs, g2o or 3DMatch .log; initial poses in it are not used."""
     method: AveragingMethod = "correntropy"
     """Correntropy bears wrong edges; plain and weighted are for graphs without any."""
     precision: Precision = field(default="float64", kw_only=True)

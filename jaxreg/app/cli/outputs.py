@@ -15,12 +15,13 @@ from jaxreg._core.status import Status
 from jaxreg.app.advice import terminal_advice
 from jaxreg.app.aligned import write_aligned
 from jaxreg.app.cli.inputs import Scans, look_of
-from jaxreg.app.cli.options import ModelOptions
+from jaxreg.app.cli.options import ModelOptions, Register
 from jaxreg.app.cli.runtime import Session
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_reconstruction, save_figure, write_report
 from jaxreg.app.result import Result, result_document, write_result
 from jaxreg.io.errors import MissingExtraError
+from jaxreg.io.printable import printable
 from jaxreg.metrics import rotation_errors, translation_errors
 
 
@@ -107,6 +108,9 @@ def write_files(
             times={k: round(v, 3) for k, v in session.times.items()},
             errors=errors,
         )
+        if isinstance(session.options, Register):
+            T = result.T_file[1]
+            document["T_target_source"] = T.tolist() if result.believed else None
         write_result(staging, result, scans, document, look)
         if shown is None:
             return result
@@ -213,11 +217,11 @@ def show_scans(session: Session, result: Result) -> None:
         overlap = "" if row is None else f"{result.overlap[row]:.2f}"
         status = Status(int(result.scan_status[i])).name
         table.add_row(
-            name,
+            printable(name),
             f"{result.num_points[i]:,}",
             f"{result.num_dropped[i]:,}",
             status + _whereabouts(int(result.component[i])),
-            pair,
+            printable(pair),
             overlap,
         )
     session.console.print(table)
@@ -249,7 +253,7 @@ def show_errors(session: Session, errors: dict[str, Any]) -> None:
     table.add_column("e_t [mm]", justify="right")
     keys = ("names", "component", "e_R", "e_t")
     for name, k, e_R, e_t in zip(*(errors[key] for key in keys), strict=True):
-        where = f"{name}{_whereabouts(k)}"
+        where = f"{printable(name)}{_whereabouts(k)}"
         table.add_row(where, f"{e_R:.5f}", f"{1e3 * e_t:.3f}")
     table.add_section()
     table.add_row(
@@ -269,7 +273,7 @@ def tell_failure(session: Session, result: Result, what: str, status: Status) ->
     """
     page = session.options.out / "report.html"
     look = f"\nThe best attempt, to look at: {page}" * page.exists()
-    sys.stderr.write(f"jaxreg: {what}.\n{terminal_advice(status)}{look}\n")
+    sys.stderr.write(f"jaxreg: {printable(what)}.\n{terminal_advice(status)}{look}\n")
     return NOT_BELIEVED
 
 

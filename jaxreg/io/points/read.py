@@ -15,6 +15,7 @@ from jaxreg.io.points import arrays, e57, las, meshes, pcd, ply, text
 from jaxreg.io.points.content import require_suffix
 from jaxreg.io.points.other_text import OF_POSES, refusal
 from jaxreg.io.points.thinning import Step, at_most, every_row, text_step
+from jaxreg.io.printable import printable
 
 
 TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
@@ -284,10 +285,10 @@ def _natural(name: str) -> list[tuple[int, int | str]]:
 
 
 def unique_names(names: list[str]) -> list[str]:
-    """The same names, later ones of a kind with -2, -3 and so on appended."""
+    """The same names, printable, later ones of a kind with -2, -3 ... appended."""
     seen: dict[str, int] = {}
     out: list[str] = []
-    for name in names:
+    for name in map(printable, names):
         seen[name] = seen.get(name, 0) + 1
         out.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
     return out

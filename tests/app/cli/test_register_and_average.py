@@ -35,6 +35,7 @@ def test_register_writes_the_motion_between_the_files(
     found = json.loads(Path("jaxreg-out/result.json").read_text())
     assert found["names"] == ["s0", "s1"]
     np.testing.assert_allclose(found["T_world_i"][1], POSES[1], atol=2e-6)
+    assert found["T_target_source"] == found["T_world_i"][1]
     assert "overlap 0.930" in capsys.readouterr().out
 
 
@@ -217,3 +218,13 @@ def test_average_lowers_the_objective(folder: Path, capsys: pytest.CaptureFixtur
     assert found["names"] == [0, 1, 2]
     assert np.shape(found["T_world_i"]) == (3, 3, 3)
     assert "objective" in capsys.readouterr().out
+
+
+def test_average_reads_the_motions_of_fragments(folder: Path):
+    edges = [(0, 1), (1, 2), (0, 2)]
+    T = [np.linalg.inv(POSES[i]) @ POSES[j] for i, j in edges]
+    jaxreg.io.write_log("g.log", jaxreg.PoseGraph.from_edges(edges, np.stack(T)))
+    assert main(["average", "g.log", "--method", "plain", "--quiet"]) == 0
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    np.testing.assert_allclose(found["T_world_i"], POSES, atol=1e-5)
+    assert found["names"] == [0, 1, 2]
