@@ -149,5 +149,5 @@ def _show(session: Session, result: Result) -> None:
         session.console.print(f"{dropped:,} rows with NaN or inf were left out.")
     session.console.print(f"T_{target}_{source} =")
     for row in result.T_file[1]:
-        session.console.print("  " + " ".join(f"{x:14.9g}" for x in row))
+        session.console.print("  " + " ".join(f"{x:16.12g}" for x in row))
     outputs.show_end(session, result.files, session.options.out)
