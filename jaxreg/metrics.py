@@ -5,15 +5,24 @@ same frame, e_t the mean distance between their translations. Poses carry a free
 frame (the gauge), so both sets are first brought into one.
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
-from jaxreg._core.checks import as_float_array, check_mask, shown
+from jaxreg._core.checks import (
+    as_float_array,
+    as_host_numbers,
+    check_count,
+    check_mask,
+    shown,
+)
 from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
+from jaxreg.geometry.kabsch import kabsch
 from jaxreg.geometry.nearest_rotation import nearest_rotation
 from jaxreg.graph.pose_graph import (
     PoseGraph,
@@ -23,7 +32,8 @@ from jaxreg.graph.pose_graph import (
 )
 
 
-Align = Literal["first", "best", "none"]
+Align = Literal["first", "best", "positions", "none"]
+_ALIGN = ("first", "best", "positions", "none")
 
 
 def align_poses(
@@ -38,8 +48,10 @@ def align_poses(
         T_world_i: `(v, d+1, d+1)` estimated poses.
         T_true_i: `(v, d+1, d+1)` true poses of the same frames.
         align: "first" so that frame 0 agrees, "best" for the rotation nearest to all
-            rotations of the frames, then the best translation, "none" for no change.
-        mask: `(v,)` the frames that count for "best", None for all.
+            rotations of the frames, then the best translation, "positions" for the
+            motion that brings the positions together (Umeyama, as `evo -a` does),
+            "none" for no change.
+        mask: `(v,)` the frames that count for "best" and "positions", None for all.
 
     Returns:
         `T_true_world @ T_world_i`.
@@ -58,6 +70,9 @@ def _aligned(T_world_i: Array, T_true_i: Array, align: Align, mask: Array) -> Ar
     if align == "first":
         return T_true_i[0] @ lie.inverse(T_world_i[0]) @ T_world_i
     dtype = T_world_i.dtype
+    if align == "positions":
+        positions = lie.translation(T_world_i), lie.translation(T_true_i)
+        return kabsch(*positions, mask.astype(dtype)) @ T_world_i
     w = mask.astype(dtype)
     w = w / jnp.maximum(jnp.sum(w), 1)
     R_est, R_true = lie.rotation(T_world_i), lie.rotation(T_true_i)
@@ -72,10 +87,8 @@ def _checked(
     T_world_i: object, T_true_i: object, align: object, mask: object
 ) -> tuple[Array, Array, Align, Array]:
     """Two sets of as many poses, and which of them count."""
-    if not isinstance(align, str) or align not in ("first", "best", "none"):
-        raise ValueError(
-            f"align: wanted 'first', 'best' or 'none', found {shown(align)}."
-        )
+    if not isinstance(align, str) or align not in _ALIGN:
+        raise ValueError(f"align: wanted one of {_ALIGN}, found {shown(align)}.")
     T = as_float_array(T_world_i, "T_world_i")
     if T.ndim != 3 or T.shape[1:] not in ((3, 3), (4, 4)) or not len(T):
         raise ValueError(
@@ -125,6 +138,37 @@ def _translation_errors(
     T = _aligned(T_world_i, T_true_i, align, mask)
     sq = jnp.sum((lie.translation(T) - lie.translation(T_true_i)) ** 2, axis=-1)
     return jnp.where(sq > 0, jnp.sqrt(jnp.where(sq > 0, sq, 1)), 0)
+
+
+def relative_errors(
+    T_world_i: ArrayLike, T_true_i: ArrayLike, delta: int = 1
+) -> tuple[Float[Array, " r"], Float[Array, " r"]]:
+    """Relative pose errors: how motions between frames differ from the true ones.
+
+    Of the frames 0, delta, 2 delta, ... each with the next one, as evo has them. No
+    common frame is needed.
+
+    Args:
+        T_world_i: `(v, d+1, d+1)` estimated poses.
+        T_true_i: `(v, d+1, d+1)` true poses of the same frames.
+        delta: frames between the two of a motion.
+
+    Returns:
+        The angles in radians and the lengths of
+        inv(inv(T_true_i) T_true_j) inv(T_world_i) T_world_j.
+    """
+    check_count(delta, "delta")
+    T, T_true, _, _ = _checked(T_world_i, T_true_i, "none", None)
+    return _relative_errors(T[::delta], T_true[::delta])
+
+
+@eqx.filter_jit
+def _relative_errors(T: Array, T_true: Array) -> tuple[Array, Array]:
+    found = lie.inverse(T[:-1]) @ T[1:]
+    gap = lie.inverse(lie.inverse(T_true[:-1]) @ T_true[1:]) @ found
+    sq = jnp.sum(lie.translation(gap) ** 2, axis=-1)
+    length = jnp.where(sq > 0, jnp.sqrt(jnp.where(sq > 0, sq, 1)), 0)
+    return lie.rotation_angle(lie.rotation(gap)), length
 
 
 def rotation_error(
@@ -181,3 +225,92 @@ def _chordal_objective(graph: PoseGraph, T_world_i: Array) -> Array:
     rotation = jnp.sum(gap[..., :-1] ** 2, axis=(-2, -1))
     translation = jnp.sum(gap[..., -1] ** 2, axis=-1)
     return jnp.sum(kappa * rotation + tau * translation)
+
+
+class Recall(NamedTuple):
+    """Of motions of pairs of fragments, as 3DMatch counts them.
+
+    Attributes:
+        recall: share of the true pairs whose motion is found.
+        precision: share of the motions found that are right; NaN without any.
+        num_right: motions that are right.
+        num_true: pairs of the truth that count.
+        num_found: motions of the estimate that count.
+        rmse: `(num_true,)` of each of these pairs; infinite where no motion is found.
+    """
+
+    recall: float
+    precision: float
+    num_right: int
+    num_true: int
+    num_found: int
+    rmse: np.ndarray
+
+
+def registration_recall(
+    graph: PoseGraph,
+    T_true: PoseGraph,
+    information: ArrayLike,
+    threshold: float = 0.2,
+) -> Recall:
+    """Registration recall and precision of the Redwood and 3DMatch benchmarks.
+
+    A motion is right where points that truly coincide are at most `threshold` apart,
+    root mean square, by their information matrix: with the gap inv(T_true) T_found as
+    e = (translation, vector part of the quaternion), e' information e / information[0,
+    0] is that distance squared. Pairs of successive fragments do not count. The pair
+    (j, i) counts as (i, j), its motion inverted.
+
+    Args:
+        graph: the motions found, 3D.
+        T_true: the true motions; its pairs have i < j.
+        information: `(e, 6, 6)` of its edges, as `io.read_info` reads them.
+        threshold: in the unit of the motions; the benchmark takes 0.2 m.
+
+    References: Choi, Zhou, Koltun 2015; Zeng et al. 2017.
+    """
+    found = _motions_by_pair(check_graph(graph, "graph"), "graph")
+    true = _motions_by_pair(check_graph(T_true, "T_true"), "T_true")
+    info = as_host_numbers(information, "information")
+    if info.shape != (T_true.num_edges, 6, 6):
+        raise ValueError(
+            f"information: wanted shape ({T_true.num_edges}, 6, 6), one for each true "
+            f"motion, found {info.shape}."
+        )
+    found = {pair: x for pair, x in found.items() if pair[1] - pair[0] > 1}
+    true = {pair: x for pair, x in true.items() if pair[1] - pair[0] > 1}
+    rmse = [
+        _coincidence(found[pair][0], T, info[row]) if pair in found else np.inf
+        for pair, (T, row) in true.items()
+    ]
+    right = int(np.sum(np.array(rmse) <= threshold))
+    return Recall(
+        right / len(true) if true else np.nan,
+        right / len(found) if found else np.nan,
+        right,
+        len(true),
+        len(found),
+        np.array(rmse),
+    )
+
+
+def _motions_by_pair(
+    graph: PoseGraph, name: str
+) -> dict[tuple[int, int], tuple[np.ndarray, int]]:
+    """`T_i_j` with i < j and its row."""
+    if graph.dim != 3:
+        raise ValueError(f"{name}: wanted 3D, found {graph.dim}D.")
+    out = {}
+    T = np.asarray(graph.T_i_j, np.float64)
+    for row in np.flatnonzero(np.asarray(graph.mask)).tolist():
+        i, j = (int(k) for k in graph.edges[row])
+        motion = T[row] if i < j else np.linalg.inv(T[row])
+        out[min(i, j), max(i, j)] = motion, row
+    return out
+
+
+def _coincidence(T: np.ndarray, T_true: np.ndarray, information: np.ndarray) -> float:
+    gap = np.linalg.inv(T_true) @ T
+    xyzw = Rotation.from_matrix(gap[:3, :3]).as_quat(canonical=True)
+    e = np.concatenate([gap[:3, 3], xyzw[:3]])
+    return float(np.sqrt(e @ information @ e / information[0, 0]))

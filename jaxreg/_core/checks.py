@@ -10,6 +10,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from jaxreg._core.host_arrays import as_host_array as as_host_array
+from jaxreg._core.host_arrays import as_host_numbers as as_host_numbers
 from jaxreg._core.typing import Key
 
 
@@ -22,28 +24,6 @@ TRACED = "traced"
 def is_concrete(x: Any) -> bool:
     """True where the values can be read, False while tracing."""
     return not isinstance(x, Tracer)
-
-
-def as_host_array(x: object, name: str) -> np.ndarray:
-    """Converts what `numpy.asarray` or DLPack takes to a NumPy array of numbers."""
-    try:
-        if hasattr(x, "__dlpack__") and not isinstance(x, np.ndarray | jax.Array):
-            x = np.from_dlpack(x)  # pyright: ignore[reportArgumentType]
-        x = np.asarray(x)
-    except (ValueError, TypeError, OverflowError) as err:
-        raise ValueError(f"{name}: not a rectangular array of numbers.") from err
-    if x.dtype.kind not in "biufc":
-        hint = " Files are read by jaxreg.io." if x.dtype.kind in "SUV" else ""
-        raise TypeError(f"{name}: wanted numbers, found dtype {x.dtype}.{hint}")
-    return x
-
-
-def as_host_numbers(x: object, name: str) -> np.ndarray:
-    """Real numbers in float64 on the host, of what is written to files."""
-    found = as_host_array(x, name)
-    if found.dtype.kind not in "iuf":
-        raise TypeError(f"{name}: wanted real numbers, found dtype {found.dtype}.")
-    return found.astype(np.float64)
 
 
 def as_float_array(x: object, name: str) -> Array:
@@ -74,9 +54,11 @@ def as_float_array(x: object, name: str) -> Array:
 def check_points(points: Array, name: str) -> int:
     """Requires `(..., n, d)` with d = 2 or 3 and n >= 1; returns d."""
     if points.ndim < 2 or points.shape[-1] not in (2, 3):
+        turned = points.ndim > 1 and points.shape[-2] in (2, 3)
+        hint = f" Points are rows: try {name}.T." if turned else ""
         raise ValueError(
             f"{name}: wanted shape (n, 2) or (n, 3) with leading batch axes at most, "
-            f"found {points.shape}."
+            f"found {points.shape}.{hint}"
         )
     if points.shape[-2] == 0:
         raise ValueError(f"{name}: holds no points, found shape {points.shape}.")

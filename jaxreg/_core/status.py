@@ -6,6 +6,9 @@ happened and what to change.
 """
 
 import enum
+from typing import Any
+
+import numpy as np
 
 
 class Status(enum.IntEnum):
@@ -13,8 +16,8 @@ class Status(enum.IntEnum):
 
     >>> import jaxreg as jr
     >>> print(jr.Status(1), "-", jr.Status(1).advice)
-    MAX_STEPS - The steps ran out before the answer stood still. Raise `max_steps` \
-(`average --budget`), or start nearer to the solution.
+    MAX_STEPS - The steps ran out before the answer stood still. Raise `max_steps`, \
+or start nearer to the solution.
     """
 
     CONVERGED = 0
@@ -38,11 +41,18 @@ class Status(enum.IntEnum):
         return _ADVICE[self]
 
 
+def counted(status: Any) -> str:
+    """How many of a batch have each status: "CONVERGED 990, LOW_OVERLAP 10"."""
+    values, counts = np.unique(np.asarray(status), return_counts=True)
+    told = zip(values.tolist(), counts.tolist(), strict=True)
+    return ", ".join(f"{Status(int(value)).name} {num}" for value, num in told)
+
+
 _ADVICE = {
     Status.CONVERGED: "Converged.",
     Status.MAX_STEPS: (
-        "The steps ran out before the answer stood still. Raise `max_steps` (`average "
-        "--budget`), or start nearer to the solution."
+        "The steps ran out before the answer stood still. Raise `max_steps`, or start "
+        "nearer to the solution."
     ),
     Status.DEGENERATE: (
         "The data leave some direction of the motion free (points on a line or a "
@@ -58,8 +68,8 @@ _ADVICE = {
     ),
     Status.LOW_OVERLAP: (
         "No pose was found at which enough of the two point sets agree. They may not "
-        "overlap; else draw more particles (`num_prior`, `--budget`) or give an "
-        "initial guess (`init`)."
+        "overlap; else draw more particles (`num_prior`) or give an initial guess "
+        "(`init`)."
     ),
     Status.AMBIGUOUS: (
         "Several poses agree about equally well (a symmetric object?), or surfaces "

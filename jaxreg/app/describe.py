@@ -13,24 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from jaxreg.io.files import text_lines
+from jaxreg.io.points.columns import COLORS, NORMALS, named
 from jaxreg.io.points.read import NamedPoints, read_named
 
 
 _MAX_POINTS = 5_000_000
 GRAPHS = (".g2o", ".g2o.gz", ".graph")
-# As PLY, PCD and E57 call them, in lower case.
-_NORMALS = (
-    {"nx", "ny", "nz"},
-    {"normal_x", "normal_y", "normal_z"},
-    {"nor:normalx", "nor:normaly", "nor:normalz"},
-)
-_COLORS = (
-    {"red", "green", "blue"},
-    {"r", "g", "b"},
-    {"rgb"},
-    {"rgba"},
-    {"colorred", "colorgreen", "colorblue"},
-)
 
 
 @dataclass(frozen=True)
@@ -117,7 +105,7 @@ def unit_notes(facts: Sequence[tuple[str, ScanFacts]]) -> list[str]:
 
 
 def _scan(name: str, scan: NamedPoints) -> ScanFacts:
-    points, lower = scan.points, {f.lower() for f in scan.fields}
+    points = scan.points
     finite = points[np.isfinite(points).all(axis=1)]
     low, high = (
         (finite.min(axis=0).astype(float), finite.max(axis=0).astype(float))
@@ -136,8 +124,8 @@ def _scan(name: str, scan: NamedPoints) -> ScanFacts:
         high=tuple(high.tolist()),
         spacing=spacing,
         non_finite=1 - len(finite) / len(points),
-        has_normals=any(names <= lower for names in _NORMALS),
-        has_colors=any(names <= lower for names in _COLORS),
+        has_normals=named(scan.fields, NORMALS) is not None,
+        has_colors=named(scan.fields, COLORS) is not None,
         hint=_hint(low, high, spacing, points.dtype) if spacing else "",
     )
 

@@ -15,6 +15,7 @@ _LOCK = ".jaxreg.lock"
 _OWN = re.compile(
     r"result\.json|figure\.png|report\.html"
     r"|poses(_\d+)?\.tum|graph(_\d+)?\.g2o|merged(_\d+)?\.ply"
+    r"|aligned(_\d+)?/[^/]+"
 )
 
 

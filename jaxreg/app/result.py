@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.status import Status
-from jaxreg.app.colors import scan_colors
+from jaxreg.app.advice import terminal_advice
+from jaxreg.app.merge import Look, write_merged
 from jaxreg.app.versions import versions
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.graphs.g2o import write_g2o
-from jaxreg.io.points.write_ply import write_ply
 from jaxreg.io.poses.tum import write_tum
 
 
 _ROW = re.compile(r"\[[-+.,\d\seE]*\]")
-MAX_MERGED_POINTS = 2_000_000
+#: Described by result.schema.json beside this file; a new number where keys change.
+RESULT_FORMAT = "jaxreg result 1"
 _PER_COMPONENT = ("poses.tum", "graph.g2o", "merged.ply")
 
 
@@ -50,6 +51,9 @@ class Result:
         weight: `(e,)` final trust, 0 to 1.
         inlier_rmse: `(e,)` in the unit of the scans.
         trace: of the solution, for the page.
+        units: `(v,)` what coordinates of the files were multiplied by, None for one.
+        attempt: whether the poses are shown, but not believed.
+        aligned: files of whole scans in the common frame.
     """
 
     names: list[str]
@@ -65,6 +69,9 @@ class Result:
     weight: np.ndarray
     inlier_rmse: np.ndarray
     trace: Any = None
+    units: np.ndarray | None = None
+    attempt: bool = False
+    aligned: tuple[str, ...] = ()
 
     @property
     def placed(self) -> np.ndarray:
@@ -79,12 +86,50 @@ class Result:
     @property
     def files(self) -> list[str]:
         """Names of the files of the result, the picture and the page included."""
+        if not self.believed:
+            shown = ["figure.png", "report.html"] if self.to_show() else []
+            return ["result.json", *shown]
         more = [
             file_of(name, k)
             for k in range(1, self.num_components)
             for name in _PER_COMPONENT
         ]
-        return ["result.json", *_PER_COMPONENT, "figure.png", "report.html", *more]
+        return [
+            "result.json",
+            *_PER_COMPONENT,
+            "figure.png",
+            "report.html",
+            *more,
+            *self.aligned,
+        ]
+
+    @property
+    def believed(self) -> bool:
+        """Whether two scans are joined."""
+        return int(self.placed.sum()) >= 2
+
+    @property
+    def T_file(self) -> np.ndarray:
+        """`T_world_i` of the coordinates that the files have, in their own units."""
+        out = np.array(self.T_world_i, np.float64)
+        if self.units is not None:
+            out[:, :-1, :-1] *= self.units[:, None, None]
+        return out
+
+    def to_show(self) -> "Result | None":
+        """Itself; where no scans are joined the two that overlap most, if any."""
+        finite = np.isfinite(self.T_i_j).all(axis=(1, 2)) & (self.overlap > 0)
+        if self.believed or self.attempt:
+            return self
+        if not finite.any():
+            return None
+        row = int(np.argmax(np.where(finite, self.overlap, -1)))
+        i, j = self.edges[row]
+        T = np.array(self.T_world_i)
+        T[i], T[j] = np.eye(T.shape[-1]), self.T_i_j[row]
+        component = np.full(len(self.names), -1)
+        component[[i, j]] = 0
+        return replace(self, T_world_i=T, component=component, attempt=True)
 
     def best_pair(self, scan: int) -> int | None:
         """The row of the pair of this scan that overlaps most, None without pairs."""
@@ -115,14 +160,15 @@ def result_document(
         errors: against a known truth, or None.
     """
     document = {
+        "format": RESULT_FORMAT,
         "command": command,
         "seed": seed,
         "status": result.status.name,
-        "advice": result.status.advice,
+        "advice": terminal_advice(result.status),
         "names": result.names,
         "T_world_i": [
             T.tolist() if ok else None
-            for T, ok in zip(result.T_world_i, result.component >= 0, strict=True)
+            for T, ok in zip(result.T_file, result.component >= 0, strict=True)
         ],
         "scans": [_scan_entry(result, i) for i in range(len(result.names))],
         "pairs": [_pair_entry(result, e) for e in range(len(result.edges))],
@@ -147,13 +193,14 @@ def write_result(
     result: Result,
     scans: Sequence[np.ndarray],
     document: dict[str, Any],
+    look: Look | None = None,
 ) -> None:
     """Writes result.json, poses.tum, graph.g2o and merged.ply into an existing folder.
 
     Components beside the model have files of their own, see `file_of`; scans alone are
-    in result.json only. In poses.tum the timestamp, in graph.g2o the id is the number
-    of the scan. graph.g2o holds the pairs that are trusted, the information being the
-    trust times the identity.
+    in result.json only, as is a result that joins no two of them. In poses.tum the
+    timestamp, in graph.g2o the id is the number of the scan. graph.g2o holds the pairs
+    that are trusted, the information being the trust times the identity.
 
     Raises:
         InputError: if a file cannot be written.
@@ -161,16 +208,17 @@ def write_result(
     """
     folder = Path(folder)
     write_json(folder / "result.json", document)
+    if not result.believed:
+        return
     for k in range(result.num_components):
         member = result.component == k
-        points, owner = merge_scans(scans, result.T_world_i, member)
-        colors = scan_colors(len(scans))[owner]
-        write_ply(folder / file_of("merged.ply", k), points, colors)
+        model = folder / file_of("merged.ply", k)
+        write_merged(model, scans, result.T_world_i, member, look)
         ids = np.flatnonzero(member)
         graph = _trusted_graph(result, ids)
         # Files keep the digits of float64 whatever the precision of the computation.
         with jax.enable_x64(True):
-            T_world_i = jnp.asarray(result.T_world_i[ids])
+            T_world_i = jnp.asarray(_rigid(result.T_world_i[ids]))
             write_tum(folder / file_of("poses.tum", k), T_world_i, timestamps=ids)
             write_g2o(folder / file_of("graph.g2o", k), graph, T_world_i, ids)
 
@@ -179,35 +227,6 @@ def file_of(name: str, component: int) -> str:
     """The name of a component's file: merged.ply, merged_1.ply, ..."""
     stem, _, suffix = name.rpartition(".")
     return f"{stem}_{component}.{suffix}" if component else name
-
-
-def merge_scans(
-    scans: Sequence[np.ndarray],
-    T_world_i: np.ndarray,
-    placed: np.ndarray,
-    max_points: int = MAX_MERGED_POINTS,
-) -> tuple[np.ndarray, np.ndarray]:
-    """All placed scans in the common frame.
-
-    Above `max_points` one point per cube is kept, the cubes being as small as that
-    number allows within a factor of 1.25.
-
-    Returns:
-        `(n, d)` points, float32 if all scans are, else float64, and `(n,)` the scan
-        that each comes from. Rows with NaN or inf are left out.
-    """
-    parts, owner = [], []
-    for k, (scan, T) in enumerate(zip(scans, T_world_i, strict=True)):
-        if placed[k]:
-            finite = scan[np.isfinite(scan).all(axis=1)].astype(np.float64)
-            parts.append(finite @ T[:-1, :-1].T + T[:-1, -1])
-            owner.append(np.full(len(finite), k))
-    points, owners = np.concatenate(parts), np.concatenate(owner)
-    if len(points) > max_points:
-        keep = _thin(points, max_points)
-        points, owners = points[keep], owners[keep]
-    narrow = all(s.dtype == np.float32 for s in scans)
-    return points.astype(np.float32 if narrow else np.float64), owners
 
 
 def _scan_entry(result: Result, i: int) -> dict[str, Any]:
@@ -219,7 +238,7 @@ def _scan_entry(result: Result, i: int) -> dict[str, Any]:
         "placed": bool(result.placed[i]),
         "component": int(result.component[i]),
         "status": status.name,
-        "advice": status.advice,
+        "advice": terminal_advice(status),
         "num_points": int(result.num_points[i]),
         "num_dropped": int(result.num_dropped[i]),
         "best_pair": best,
@@ -235,7 +254,13 @@ def _pair_entry(result: Result, e: int, motion: bool = True) -> dict[str, Any]:
         "weight": float(result.weight[e]),
         "inlier_rmse": float(result.inlier_rmse[e]),
     }
-    return {**entry, "T_i_j": result.T_i_j[e].tolist()} if motion else entry
+    if not motion:
+        return entry
+    T = np.array(result.T_i_j[e], np.float64)
+    if result.units is not None:  # between coordinates as the files have them
+        T[:-1] /= result.units[i]
+        T[:-1, :-1] *= result.units[j]
+    return {**entry, "T_i_j": T.tolist()}
 
 
 def _trusted_graph(result: Result, ids: np.ndarray) -> PoseGraph:
@@ -245,23 +270,20 @@ def _trusted_graph(result: Result, ids: np.ndarray) -> PoseGraph:
     keep = (edges >= 0).all(axis=1) & (result.weight > 1e-6)
     return PoseGraph.from_edges(
         edges[keep],
-        result.T_i_j[keep],
+        _rigid(result.T_i_j[keep]),
         num_poses=len(ids),
         weight=result.weight[keep],
     )
 
 
-def _thin(points: np.ndarray, max_points: int) -> np.ndarray:
-    low = points.min(axis=0)
-    extent = float(np.ptp(points, axis=0).max())
-    size = extent / 4096
-    while True:
-        cell = ((points - low) / size).astype(np.int64)
-        strides = np.cumprod([1, *(cell.max(axis=0)[:-1] + 1)])
-        _, first = np.unique(cell @ strides, return_index=True)
-        if len(first) <= max_points:
-            return np.sort(first)
-        size *= 1.25
+def _rigid(T: np.ndarray) -> np.ndarray:
+    """Motions without the factor of their rotations, which pose files do not know."""
+    out = np.array(T, np.float64)
+    d = out.shape[-1] - 1
+    size = np.abs(np.linalg.det(out[:, :d, :d])) ** (1 / d)
+    scaled = np.abs(size - 1) > 1e-6
+    out[scaled, :d, :d] /= size[scaled, None, None]
+    return out
 
 
 def without_nan(value: Any) -> Any:

@@ -6,6 +6,7 @@ from typing import overload
 from jax.sharding import AbstractMesh, Mesh
 
 from jaxreg._core.checks import check_callable, check_count, check_key, check_method
+from jaxreg._core.log import log_solution
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
@@ -121,4 +122,6 @@ def average(
     if isinstance(graph, PoseGraph) and graph.edges.ndim == 3:
         return average_batch(graph, method, init, key, batch_size, devices)
     one = check_graph(graph, "graph")
-    return average_graph(one, method, check_init(init, one, "init"), key)
+    solution = average_graph(one, method, check_init(init, one, "init"), key)
+    log_solution("average", solution)
+    return solution

@@ -13,7 +13,7 @@ from jaxreg._core.adjoint import refusing
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.loop import status_of
-from jaxreg._core.status import Status
+from jaxreg._core.status import Status, counted
 from jaxreg._core.typing import Key, StatusArray
 from jaxreg.averaging.likelihood import log_evidence, nothing_agrees
 from jaxreg.averaging.measures import frobenius, length_scale, weighted_mean
@@ -75,8 +75,11 @@ class AveragingSolution(eqx.Module):
         )
 
     def __repr__(self) -> str:
-        if not is_concrete(self.status) or self.status.ndim:
+        if not is_concrete(self.status):
             return f"AveragingSolution(T_world_i {self.T_world_i.shape})"
+        if self.status.ndim:
+            batch = f"batch={self.status.shape}, {counted(self.status)}"
+            return f"AveragingSolution({batch})"
         status = Status(int(self.status)).name
         trusted = int(jnp.sum(self.edge_weight > 0.5))
         parts = int(jnp.unique(self.component).shape[0])

@@ -17,8 +17,10 @@ from .interop import to_gtsam as to_gtsam
 from .interop import to_open3d as to_open3d
 from .interop import to_open3d_graph as to_open3d_graph
 from .interop import to_trimesh as to_trimesh
+from .moved.write import write_moved as write_moved
 from .points.read import read_points as read_points
 from .points.read import read_scans as read_scans
+from .points.write import write_points as write_points
 from .points.write_ply import write_ply as write_ply
 from .poses.kitti import read_kitti as read_kitti
 from .poses.kitti import write_kitti as write_kitti

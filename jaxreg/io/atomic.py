@@ -70,6 +70,8 @@ def atomic_write(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
 def atomic_folder(folder: str | Path, replaces: Collection[str] = ()) -> Iterator[Path]:
     """Yields a staging folder whose files move into `folder` when the block succeeds.
 
+    Those in folders of it move into folders of the same names.
+
     If the block raises, none of them appears: `folder` never holds half a result. A
     process that is killed while they move leaves them for `complete_folder`.
 
@@ -88,7 +90,7 @@ def atomic_folder(folder: str | Path, replaces: Collection[str] = ()) -> Iterato
     staging = Path(tempfile.mkdtemp(prefix=_STAGING, dir=folder))
     try:
         yield staging
-        names = sorted(file.name for file in staging.iterdir())
+        names = [file.relative_to(staging).as_posix() for file in _files(staging)]
         for name in names:
             if (folder / name).is_dir():
                 raise InputError(
@@ -124,10 +126,16 @@ def _move(ready: Path) -> None:
     with contextlib.suppress(FileNotFoundError):  # it goes last
         for name in json.loads((ready / _OLD).read_text(encoding="utf-8")):
             (ready.parent / name).unlink(missing_ok=True)
-    for file in sorted(ready.iterdir()):
+    for file in _files(ready):
         if file.name != _OLD:
-            os.replace(file, ready.parent / file.name)
+            place = ready.parent / file.relative_to(ready)
+            place.parent.mkdir(exist_ok=True)
+            os.replace(file, place)
     shutil.rmtree(ready)
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.rglob("*") if file.is_file())
 
 
 def require_writable(folder: str | Path) -> None:

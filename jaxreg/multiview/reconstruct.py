@@ -23,6 +23,7 @@ from jaxreg._core.checks import (
     is_concrete,
     shown,
 )
+from jaxreg._core.log import log_solution, log_stage
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
@@ -140,7 +141,11 @@ def reconstruct(
             )
         return _of_all_pairs(method, averaging, inputs, key)
 
-    report = progress if progress is not None else _silent
+    def report(stage: str, done: int, total: int) -> None:
+        log_stage(stage, done, total)
+        if progress is not None:
+            progress(stage, done, total)
+
     report("preparing scans", 0, 1)
     prepared = jax.block_until_ready(prepare_scans(method, *inputs))
     report("preparing scans", 1, 1)
@@ -155,7 +160,9 @@ def reconstruct(
     solution = finish(method, averaging, prepared, motions_padded, hold)
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
-    return far.back(solution.of_pairs(len(motions.overlap)))
+    solution = far.back(solution.of_pairs(len(motions.overlap)))
+    log_solution("reconstruct", solution)
+    return solution
 
 
 def _of_all_pairs(
@@ -212,7 +219,3 @@ def _checked(order: str) -> Order:
     if isinstance(order, str) and (order == "any" or order == "sequential"):
         return order
     raise ValueError(f"order: wanted 'any' or 'sequential', found {shown(order)}.")
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    del stage, done, total

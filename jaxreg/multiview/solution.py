@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import is_concrete
-from jaxreg._core.status import Status
+from jaxreg._core.status import Status, counted
 from jaxreg._core.typing import StatusArray
 from jaxreg.averaging import AveragingTrace
 from jaxreg.graph import PoseGraph
@@ -82,8 +82,11 @@ class ReconstructionSolution(eqx.Module):
 
     def __repr__(self) -> str:
         """One line: status, scans placed, other components, pairs trusted."""
-        if not is_concrete(self.status) or self.status.ndim:
+        if not is_concrete(self.status):
             return f"ReconstructionSolution(T_world_i {self.T_world_i.shape})"
+        if self.status.ndim:
+            batch = f"batch={self.status.shape}, {counted(self.status)}"
+            return f"ReconstructionSolution({batch})"
         others = np.bincount(np.asarray(self.component) + 1)[2:]
         more = f", apart from them {' and '.join(map(str, others))}"
         return (

@@ -11,7 +11,8 @@ from jax.scipy.special import gammainc
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.brief import BriefModule
-from jaxreg._core.status import Status
+from jaxreg._core.checks import is_concrete
+from jaxreg._core.status import Status, counted
 from jaxreg._core.typing import Key, Mask, Motion, Points
 from jaxreg.cloud import Frames, PointCloud
 from jaxreg.geometry import lie
@@ -146,7 +147,7 @@ class RegistrationSolution(eqx.Module):
     trace: SearchTrace | None = None
 
     def __repr__(self) -> str:
-        """One line: status, fitness, residual."""
+        """One line: status, fitness, residual; of a batch the number of each status."""
         if isinstance(self.status, Array) and self.status.ndim == 0:
             try:
                 status = Status(int(self.status)).name
@@ -159,7 +160,10 @@ class RegistrationSolution(eqx.Module):
                 )
             except TypeError:  # a tracer has a shape but no value
                 pass
-        return f"RegistrationSolution(batch={np.shape(self.status)})"
+        counts = ""
+        if isinstance(self.status, Array | np.ndarray) and is_concrete(self.status):
+            counts = f", {counted(self.status)}"
+        return f"RegistrationSolution(batch={np.shape(self.status)}{counts})"
 
 
 class AbstractRegistrar(BriefModule):

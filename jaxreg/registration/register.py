@@ -20,6 +20,7 @@ from jaxreg._core.checks import (
     check_rigid,
     is_concrete,
 )
+from jaxreg._core.log import log_solution
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.batching.devices import chosen_devices
 from jaxreg.batching.padding import (
@@ -190,7 +191,9 @@ def register(
         sol = register_batch(method, batch, pair, init, key, *how)
     else:
         sol = _register_one(method, _rounded_up(pair), init, key)
-    return moved_back(sol, here, there)
+    sol = moved_back(sol, here, there)
+    log_solution("register", sol)
+    return sol
 
 
 def _check_init(

@@ -7,9 +7,9 @@ import numpy as np
 import plyfile
 
 from jaxreg._core.status import Status
+from jaxreg.app.merge import merge_scans
 from jaxreg.app.result import (
     Result,
-    merge_scans,
     result_document,
     write_json,
     write_result,
@@ -146,10 +146,10 @@ def test_large_models_are_thinned_evenly_and_keep_the_type():
     scans = [RNG.uniform(size=(4000, 3)).astype(np.float32) for _ in range(3)]
     scans[1][7] = np.nan
     T = np.tile(np.eye(4), (3, 1, 1))
-    full, owner = merge_scans(scans, T, np.array([True, True, False]))
+    full, owner, _ = merge_scans(scans, T, np.array([True, True, False]))
     assert (full.shape, full.dtype) == ((7999, 3), np.float32)
     assert np.bincount(owner).tolist() == [4000, 3999]
-    thin, owner = merge_scans(scans, T, np.ones(3, bool), max_points=1000)
+    thin, owner, _ = merge_scans(scans, T, np.ones(3, bool), max_points=1000)
     assert 500 < len(thin) <= 1000
     assert len(owner) == len(thin)
     corners = (thin > 0.5) @ np.array([1, 2, 4])

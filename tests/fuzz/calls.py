@@ -298,6 +298,8 @@ def _measures() -> Iterator[Call]:
         metrics.translation_error,
     ):
         yield Call(f"metrics.{function.__name__}", function, poses, _anything)
+    good = {"T_world_i": POSES, "T_true_i": POSES, "delta": 2}
+    yield Call("metrics.relative_errors", metrics.relative_errors, good, _anything)
     good = {"graph": GRAPH, "T_world_i": POSES}
     name = "metrics.chordal_objective"
     yield Call(name, metrics.chordal_objective, good, _anything)
@@ -311,6 +313,7 @@ def _files() -> Iterator[Call]:
     timed = {"T_world_i": POSES, "timestamps": ids.astype(float)}
     for write, read, suffix, good in (
         (io.write_ply, io.read_points, ".ply", {**cloud, "binary": True}),
+        (io.write_points, io.read_points, ".csv", cloud),
         (io.write_g2o, io.read_g2o, ".g2o", graph),
         (io.write_g2o, io.read_g2o_poses, ".g2o", graph),
         (io.write_tum, io.read_tum, ".tum", timed),

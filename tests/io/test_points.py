@@ -137,6 +137,31 @@ def test_a_readme_among_scans_is_skipped_with_a_note(tmp_path: Path):
     assert names == ["a", "b"]
 
 
+@pytest.mark.parametrize(
+    "other",
+    [
+        "",
+        "Scans of 2024\nresolution\n0.5 0.5\nmade by hand\n",
+        "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n",
+        "0 1 2 3 0 0 0 1\n1 1 2 4 0 0 0 1\n",
+        "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 2 0 0 1 3\n",
+    ],
+)
+def test_other_text_among_scans_does_not_stop_them(tmp_path: Path, other: str):
+    np.save(tmp_path / "a.npy", CLOUD)
+    (tmp_path / "notes.txt").write_text(other)
+    with pytest.warns(UserWarning, match=r"notes\.txt: holds no points, skipped"):
+        names, _ = read_scans(tmp_path)
+    assert names == ["a"]
+
+
+def test_a_scan_that_was_not_exported_stops_a_folder(tmp_path: Path):
+    np.save(tmp_path / "a.npy", CLOUD)
+    (tmp_path / "b.xyz").write_text("")
+    with pytest.raises(InputError, match=r"b\.xyz: the file is empty"):
+        read_scans(tmp_path)
+
+
 def _write(path: Path, content: bytes) -> Path:
     path.write_bytes(content)
     return path

@@ -1,6 +1,7 @@
 """`jaxreg average`: poses from the relative motions of a g2o file."""
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -8,12 +9,13 @@ import numpy as np
 from rich.table import Table
 
 from jaxreg._core.status import Status
+from jaxreg.app.advice import terminal_advice
 from jaxreg.app.cli import outputs
 from jaxreg.app.cli.options import Average
 from jaxreg.app.cli.runtime import Session, key_of
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_graph, save_figure, write_graph_report
-from jaxreg.app.result import write_json
+from jaxreg.app.result import RESULT_FORMAT, write_json
 from jaxreg.app.versions import versions
 from jaxreg.averaging import (
     AveragingSolution,
@@ -26,6 +28,7 @@ from jaxreg.averaging import (
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.errors import InputError
 from jaxreg.io.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
+from jaxreg.io.graphs.redwood import read_log
 from jaxreg.io.poses.tum import write_tum
 from jaxreg.metrics import chordal_objective
 
@@ -46,8 +49,7 @@ def run(command: Average, session: Session) -> int:
     method = METHODS[command.method](**steps)
     with session.timed("read"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        graph = read_g2o(command.graph)
-        ids, _ = read_g2o_poses(command.graph)
+        graph, ids = _read(command.graph)
     for message in {str(w.message) for w in caught}:
         session.console.print(message)
     key = key_of(command)
@@ -63,6 +65,15 @@ def run(command: Average, session: Session) -> int:
     _show(session, graph, sol, objective)
     outputs.show_end(session, FILES, command.out)
     return 0
+
+
+def _read(path: Path) -> tuple[PoseGraph, np.ndarray]:
+    """The motions, and what the file calls the frames."""
+    if path.suffix.lower() == ".log":
+        graph = read_log(path)
+        return graph, np.arange(graph.num_poses)
+    ids, _ = read_g2o_poses(path)
+    return read_g2o(path), ids
 
 
 def _write(
@@ -124,8 +135,9 @@ def _document(
     status = Status(int(sol.status))
     poses = np.asarray(sol.T_world_i)
     return {
+        "format": RESULT_FORMAT,
         "status": status.name,
-        "advice": status.advice,
+        "advice": terminal_advice(status),
         "objective_before": objective[0],
         "objective_after": objective[1],
         "names": ids.tolist(),
@@ -153,7 +165,7 @@ def _show(
         f"of {graph.num_edges} edges trusted, {int(sol.num_steps)} steps."
     )
     if status != Status.CONVERGED:
-        session.console.print(status.advice)
+        session.console.print(terminal_advice(status))
     session.console.print(
         "Objective: sum of kappa |R_j - R_i R_i_j|^2 + tau |t_j - t_i - R_i t_i_j|^2 "
         "(SE-Sync)."

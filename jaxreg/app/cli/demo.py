@@ -2,7 +2,7 @@
 
 from jaxreg.app.cli import outputs
 from jaxreg.app.cli.inputs import Scans
-from jaxreg.app.cli.multiview import reconstruct_scans, report, require_two_placed
+from jaxreg.app.cli.multiview import reconstruct_scans, report
 from jaxreg.app.cli.options import Demo
 from jaxreg.app.cli.runtime import Session, key_of, method_of
 from jaxreg.datasets.sculpture import sculpture_scans
@@ -21,7 +21,5 @@ def run(command: Demo, session: Session) -> int:
     scans = Scans(names, points, names)
     with session.progress() as progress, session.timed("run", computes=True):
         result = reconstruct_scans(scans, key, method, progress)
-    require_two_placed(result, scans)
     errors = outputs.pose_errors(result, names, T_world_i)
-    report(session, result, scans, errors)
-    return 0
+    return report(session, result, scans, errors)

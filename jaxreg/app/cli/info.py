@@ -9,33 +9,48 @@ from typing import Any
 
 from jaxreg.app.cli.options import Info
 from jaxreg.app.describe import GRAPHS, GraphFacts, ScanFacts, describe, unit_notes
-from jaxreg.io.errors import InputError
+from jaxreg.io.errors import InputError, MissingExtraError
 from jaxreg.io.points.read import point_files, prose_files
+from jaxreg.io.printable import printable
 
 
 def run(command: Info) -> int:
     """Runs the command; returns the exit code."""
     if not command.files:
         raise InputError("No files given.\nUsage: jaxreg info FILE ...")
-    # All are read before a word is said: a wrong one leaves no half of an answer.
-    found = [(file, describe(file)) for f in command.files for file in _expand(f)]
+    found: list[tuple[Path, list[ScanFacts] | GraphFacts]] = []
+    wrong: list[tuple[Path, str]] = []
+    for place in command.files:
+        try:
+            files = _expand(place)
+        except InputError as err:
+            wrong.append((place, str(err)))
+            continue
+        for file in files:
+            try:
+                found.append((file, describe(file)))
+            except (InputError, MissingExtraError) as err:
+                wrong.append((file, str(err)))
     scans = [
         (str(file) if len(facts) == 1 else f"{file}:{scan.name}", scan)
         for file, facts in found
         if not isinstance(facts, GraphFacts)
         for scan in facts
     ]
-    skipped = [file for f in command.files for file in prose_files(f)]
+    skipped = [f for place in command.files for f in prose_files(place)]
     notes = [f"{file}: holds no points, skipped." for file in skipped]
     notes += unit_notes(scans)
     if command.json:
         files = [_entry(file, facts) for file, facts in found]
-        text = json.dumps({"files": files, "notes": notes}, indent=1)
-    else:
+        files += [{"file": str(file), "error": message} for file, message in wrong]
+        sys.stdout.write(json.dumps({"files": files, "notes": notes}, indent=1) + "\n")
+    elif found:
         blocks = [_block(file, facts) for file, facts in found]
-        text = "\n\n".join([*blocks, *notes])
-    sys.stdout.write(text + "\n")
-    return 0
+        sys.stdout.write(printable("\n\n".join([*blocks, *notes])) + "\n")
+    sys.stdout.flush()
+    for _, message in wrong:
+        sys.stderr.write(f"jaxreg: {printable(message)}\n")
+    return 2 if wrong else 0
 
 
 def _expand(path: Path) -> list[Path]:

@@ -7,8 +7,12 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from jaxreg.app.aligned import ScanFile, scan_file
+from jaxreg.app.cli.options import ModelOptions
+from jaxreg.app.merge import Look
 from jaxreg.cloud import OTHER_UNIT
 from jaxreg.io.errors import InputError
+from jaxreg.io.points.attributes import read_attributes
 from jaxreg.io.points.read import (
     point_files,
     prose_files,
@@ -31,12 +35,18 @@ class Scans:
         points: `(n_i, d)` arrays, rows with NaN or inf included.
         places: file, and key or file name within, for messages.
         notes: what was left out of them.
+        files: where each is whole, with its key in an archive.
+        fields: names of the columns of each file.
+        steps: of how many rows of each one was read.
     """
 
     names: list[str]
     points: list[np.ndarray]
     places: list[str]
     notes: tuple[str, ...] = ()
+    files: tuple[ScanFile, ...] = ()
+    fields: tuple[tuple[str, ...], ...] = ()
+    steps: tuple[int, ...] = ()
 
     def centred(self) -> tuple[list[np.ndarray], np.ndarray]:
         """Scans moved to their own middles, and these, `(v, d)` float64.
@@ -57,8 +67,12 @@ class Scans:
         return moved, np.stack(middles)
 
 
-def load_scans(paths: Sequence[Path]) -> Scans:
+def load_scans(paths: Sequence[Path], units: Sequence[float] | None = None) -> Scans:
     """Reads the scans of a command line and refuses what cannot be registered.
+
+    Args:
+        paths: files, folders, archives.
+        units: a factor for each path, which its coordinates are multiplied by.
 
     Raises:
         InputError: if a file cannot be read, there are fewer than two scans, 2D and 3D
@@ -69,30 +83,62 @@ def load_scans(paths: Sequence[Path]) -> Scans:
     points: list[np.ndarray] = []
     places: list[str] = []
     notes: list[str] = []
-    for path in paths:
+    files: list[ScanFile] = []
+    fields: list[tuple[str, ...]] = []
+    steps: list[int] = []
+    for path, unit in zip(paths, units or [1.0] * len(paths), strict=True):
         notes += [f"{file}: holds no points, skipped." for file in prose_files(path)]
         found = [
-            item
+            (file, *item)
             for file in point_files(path)
             for item in read_named(file, _MAX_POINTS).items()
         ]
         alone = len(found) == 1 and not path.is_dir()
-        for name, scan in found:
+        for file, name, scan in found:
             names.append(name)
-            points.append(scan.points)
+            files.append(scan_file(file, name))
+            fields.append(scan.fields)
+            steps.append(scan.step)
+            points.append(scan.points if unit == 1 else unit * scan.points)
             places.append(str(path) if alone else f"{path} ({name})")
             if scan.step > 1:
                 notes.append(
                     f"{places[-1]}: large, one of {scan.step} points is used, "
                     f"{len(scan.points):,} in all."
                 )
-    scans = Scans(unique_names(names), points, places, tuple(notes))
+    names = unique_names(names)
+    named = (x._replace(name=n) for x, n in zip(files, names, strict=True))
+    more = tuple(notes), tuple(named), tuple(fields), tuple(steps)
+    scans = Scans(names, points, places, *more)
     _require_two(scans)
     _require_one_dimension(scans)
     _require_one_unit(scans)
     for place, array in zip(scans.places, scans.points, strict=True):
         _require_points(place, array)
     return scans
+
+
+def look_of(scans: Scans, options: ModelOptions) -> Look:
+    """Colours and normals of the points that were read, as the options want them."""
+    found = [
+        read_attributes(file.file, fields, step, file.key)
+        for file, fields, step in zip(
+            scans.files, scans.fields, scans.steps, strict=True
+        )
+    ]
+    fits = [
+        [x is not None and len(x) == len(points) for x in some]
+        for some, points in zip(found, scans.points, strict=True)
+    ]
+    own = options.color == "own"
+    return Look(
+        [
+            a.colors if own and ok[1] else None
+            for a, ok in zip(found, fits, strict=True)
+        ],
+        [a.normals if ok[0] else None for a, ok in zip(found, fits, strict=True)],
+        options.voxel,
+    )
 
 
 def _require_two(scans: Scans) -> None:
@@ -121,7 +167,8 @@ def _require_one_unit(scans: Scans) -> None:
         if ratio > OTHER_UNIT or 0 < ratio < 1 / OTHER_UNIT:
             raise InputError(
                 f"{place}: spans {extent:.4g}, the others about {usual:.4g}: is it in "
-                "another unit?\nScale it to the unit of the others, or leave it out."
+                "another unit?\nScale it to the unit of the others (of two scans: "
+                "register --unit mm m), or leave it out."
             )
 
 

@@ -1,7 +1,8 @@
 """Entry point of the command `jaxreg`: parses, dispatches, and speaks of errors.
 
-Exit codes: 0 done, 2 bad input (a message of one or two lines), 130 interrupted, 143
-ended by SIGTERM, 129 by SIGHUP, 141 when nobody reads the output any more.
+Exit codes: 0 done, 2 bad input (a message of one or two lines), 3 computed, but the
+answer is not believed (its best attempt is written), 130 interrupted, 143 ended by
+SIGTERM, 129 by SIGHUP, 141 when nobody reads the output any more.
 """
 
 import _thread
@@ -20,6 +21,7 @@ from typing import NoReturn
 from jaxreg.app.folder import held
 from jaxreg.app.versions import version
 from jaxreg.io.errors import InputError, MissingExtraError
+from jaxreg.io.printable import printable
 
 
 _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
@@ -87,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()  # what is not written now would fail behind Python's end
         return code
     except (InputError, MissingExtraError) as err:
-        sys.stderr.write(f"jaxreg: {err}\n")
+        sys.stderr.write(f"jaxreg: {printable(str(err))}\n")
         return 2
     except BrokenPipeError:  # as in `jaxreg ... | head`: nobody reads on
         _drop_output()
@@ -95,7 +97,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as err:
         where = f"{err.filename}: " if err.filename else ""
         sys.stderr.write(
-            f"jaxreg: {where}{err.strerror or err}; no results were written.\n"
+            f"jaxreg: {printable(where)}{err.strerror or err}; no results were "
+            "written.\n"
         )
         _drop_output()
         return 2
@@ -124,7 +127,7 @@ def _run(arguments: list[str]) -> int:
         os.environ["PYTHON_TYRO_BACKEND"] = "argparse"
     import tyro
 
-    from jaxreg.app.cli.options import COMMANDS, Info
+    from jaxreg.app.cli.options import COMMANDS, Options
 
     command = tyro.cli(
         COMMANDS,
@@ -138,7 +141,7 @@ def _run(arguments: list[str]) -> int:
     )
     # What a command needs is imported when it is known which one it is.
     module = import_module(f"jaxreg.app.cli.{type(command).__name__.lower()}")
-    if isinstance(command, Info):
+    if not isinstance(command, Options):
         return module.run(command)
     from jaxreg.app.cli import runtime
 

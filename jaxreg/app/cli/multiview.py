@@ -27,6 +27,7 @@ def run(command: Multiview, session: Session) -> int:
     with session.timed("read"):
         if not command.scans:
             raise InputError("No scans given.\nUsage: jaxreg multiview SCAN SCAN ...")
+        command.check_model()
         scans = load_scans(command.scans)
         command.check_known(scans.points[0].shape[1])
         _check_viewpoint(command.viewpoint, scans)
@@ -55,11 +56,10 @@ def run(command: Multiview, session: Session) -> int:
             f"pairs kept in {log.path}: {len(log)}; "
             "the same command with --resume goes on from there"
         ) from err
-    require_two_placed(result, scans)
     errors = None if truth is None else outputs.pose_errors(result, *truth)
-    report(session, result, scans, errors)
+    code = report(session, result, scans, errors)
     log.remove()
-    return 0
+    return code
 
 
 def _located(command: Multiview, scans: Scans) -> jaxreg.ScanPositions | None:
@@ -176,14 +176,21 @@ def _pairs(motions: Any) -> Pairs:
     )
 
 
-def require_two_placed(result: Result, scans: Scans) -> None:
-    """Refuses a result in which no two scans could be joined.
+def report(
+    session: Session, result: Result, scans: Scans, errors: dict[str, Any] | None
+) -> int:
+    """Writes the files and prints the tables; returns the exit code."""
+    result = outputs.write_files(session, result, scans.points, errors, read=scans)
+    outputs.show_scans(session, result)
+    if not result.believed:
+        return _tell_none_joined(session, result, scans)
+    if errors is not None:
+        outputs.show_errors(session, errors)
+    outputs.show_end(session, result.files, session.options.out)
+    return 0
 
-    Raises:
-        InputError: that names the scans, or the first of them and their number.
-    """
-    if result.placed.sum() >= 2:
-        return
+
+def _tell_none_joined(session: Session, result: Result, scans: Scans) -> int:
     places = scans.places
     who = (
         " and ".join(places)
@@ -193,18 +200,8 @@ def require_two_placed(result: Result, scans: Scans) -> None:
     status = (
         result.status if result.status != Status.DISCONNECTED else Status.LOW_OVERLAP
     )
-    raise InputError(f"{who}: no two scans could be joined.\n{status.advice}")
-
-
-def report(
-    session: Session, result: Result, scans: Scans, errors: dict[str, Any] | None
-) -> None:
-    """Writes the files and prints the tables."""
-    outputs.write_files(session, result, scans.points, errors)
-    outputs.show_scans(session, result)
-    if errors is not None:
-        outputs.show_errors(session, errors)
-    outputs.show_end(session, result.files, session.options.out)
+    what = f"{who}: no two scans could be joined"
+    return outputs.tell_failure(session, result, what, status)
 
 
 def _read_truth(path: Path, scans: Scans) -> tuple[list[str], np.ndarray]:

@@ -17,6 +17,19 @@ from jaxreg.io.errors import InputError
 Precision: TypeAlias = Literal["float32", "float64"]
 Order: TypeAlias = Literal["any", "sequential"]
 AveragingMethod: TypeAlias = Literal["correntropy", "plain", "weighted"]
+Align: TypeAlias = Literal["first", "best", "positions", "none"]
+PairMethod: TypeAlias = Literal["filter", "icp", "correlation"]
+Color: TypeAlias = Literal["scan", "own"]
+Unit: TypeAlias = Literal["mm", "cm", "m", "km", "in", "ft"]
+#: Of each unit in metres.
+UNITS: dict[Unit, float] = {
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "m": 1.0,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,13 +71,33 @@ class SearchOptions(Options):
             )
 
 
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(SearchOptions):
+    """Options of the commands that write scans from files in one frame."""
+
+    save_aligned: bool = False
+    """Write each scan whole in the common frame, too: its format, all it holds."""
+    color: Color = "scan"
+    """Of merged.ply: one for each scan, or the scans' own where they have them."""
+    voxel: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: by size)"),
+    ] = None
+    """Edge of cubes of which merged.ply has one point each; else two million points."""
+
+    def check_model(self) -> None:
+        """Requires an edge above zero."""
+        if self.voxel is not None and not 0 < self.voxel < math.inf:
+            raise InputError(f"--voxel {self.voxel}: wanted a number above zero.")
+
+
 @dataclass(frozen=True)
 class Demo(SearchOptions):
     """Scan a sculpture from twelve views, reconstruct it, compare to the truth."""
 
 
 @dataclass(frozen=True)
-class Register(SearchOptions):
+class Register(ModelOptions):
     """Move one scan onto another, without an initial guess."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
@@ -77,10 +110,49 @@ class Register(SearchOptions):
         tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
     ] = None
     """About where the source's origin is in the target's frame; see --deviation."""
+    init: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar='FILE|"16 NUMBERS"', help_behavior_hint="(default: none)"
+        ),
+    ] = None
+    """A guess: the matrix that maps the source to the target, or a result.json."""
+    method: PairMethod = "filter"
+    """The filter needs no guess; the others go on from one, or from the middles."""
+    scale: bool = False
+    """The source may also grow or shrink; of icp alone."""
+    unit: Annotated[
+        tuple[Unit, Unit] | None,
+        tyro.conf.arg(
+            metavar="SOURCE TARGET", help_behavior_hint="(default: the same)"
+        ),
+    ] = None
+    """Units of both scans: mm, cm, m, km, in, ft; the result has the target's."""
+    max_distance: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: no limit)"),
+    ] = None
+    """Points farther from the target do not count; of icp alone."""
+
+    def check_method(self) -> None:
+        """Refuses options that the method cannot use."""
+        icp = {"--scale": self.scale, "--max-distance": self.max_distance is not None}
+        search = {"--upright": self.upright, "--position": self.position is not None}
+        wrong = icp if self.method != "icp" else {}
+        wrong |= search if self.method != "filter" else {}
+        for option in (name for name, given in wrong.items() if given):
+            needed = "icp" if option in icp else "filter"
+            raise InputError(f"{option}: only with --method {needed}.")
+        if self.init is not None and any(search.values()):
+            raise InputError("--init: takes the place of --upright and --position.")
+        if self.max_distance is not None and not self.max_distance > 0:
+            raise InputError(
+                f"--max-distance {self.max_distance}: wanted a number above zero."
+            )
 
 
 @dataclass(frozen=True)
-class Multiview(SearchOptions):
+class Multiview(ModelOptions):
     """Bring scans into one frame, without an initial guess."""
 
     scans: Annotated[
@@ -113,8 +185,8 @@ class Multiview(SearchOptions):
 class Average(Options):
     """Find poses that agree with the relative motions of a pose graph."""
 
-    graph: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GRAPH.g2o")]
-    """A g2o file; its vertices are not used, the answer comes from its edges alone."""
+    graph: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GRAPH")]
+    """Motions of pairs, g2o or 3DMatch .log; initial poses in it are not used."""
     method: AveragingMethod = "correntropy"
     """Correntropy bears wrong edges; plain and weighted are for graphs without any."""
     precision: Precision = field(default="float64", kw_only=True)
@@ -126,6 +198,51 @@ class Average(Options):
         ),
     ] = None
     """Steps of the method, at most."""
+
+
+@dataclass(frozen=True)
+class Apply:
+    """Move scans by poses that are written already, whole and in their formats."""
+
+    poses: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="POSES")]
+    """A result.json, or poses as TUM, KITTI, g2o, .conf, .log, one 4 x 4 matrix."""
+    scans: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="SCAN ...", help_behavior_hint="(required)"),
+    ]
+    """Files, folders or archives of scans, in the order of poses without names."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("jaxreg-aligned")
+    """For the moved scans; made if needed."""
+    inverse: bool = False
+    """The poses map the world to the scans; move by their inverses."""
+    quiet: bool = False
+    """Print nothing but errors."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare poses, or motions of pairs, with true ones."""
+
+    estimate: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ESTIMATE")]
+    """A result.json, or poses as TUM, KITTI, g2o, .conf, .log; or a .log of pairs."""
+    truth: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TRUTH")]
+    """The same; beside a .log of pairs its .info tells the registration recall."""
+
+    align: Align = "first"
+    """Frames first agree in this: the first pose, rotations (best), positions, none."""
+    delta: int = 1
+    """Frames between the two of a relative error."""
+    max_difference: float = 0.01
+    """Of two timestamps, in seconds, that count as one."""
+    threshold: float = 0.2
+    """Distance of coinciding points, up to which the motion of a pair is right."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(default: none)"),
+    ] = None
+    """For evaluation.json and evaluation.png; made if needed."""
+    json: bool = False
+    """Print one JSON object instead."""
 
 
 @dataclass(frozen=True)
@@ -146,5 +263,7 @@ COMMANDS = (
     | Annotated[Register, tyro.conf.subcommand("register")]
     | Annotated[Multiview, tyro.conf.subcommand("multiview")]
     | Annotated[Average, tyro.conf.subcommand("average")]
+    | Annotated[Apply, tyro.conf.subcommand("apply")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Info, tyro.conf.subcommand("info")]
 )

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,28 @@ import numpy as np
 from rich.table import Table
 
 from jaxreg._core.status import Status
+from jaxreg.app.advice import terminal_advice
+from jaxreg.app.aligned import write_aligned
+from jaxreg.app.cli.inputs import Scans, look_of
+from jaxreg.app.cli.options import ModelOptions, Register
 from jaxreg.app.cli.runtime import Session
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_reconstruction, save_figure, write_report
 from jaxreg.app.result import Result, result_document, write_result
 from jaxreg.io.errors import MissingExtraError
+from jaxreg.io.printable import printable
 from jaxreg.metrics import rotation_errors, translation_errors
 
 
+#: The exit code where a computation ended, and its answer is not believed.
+NOT_BELIEVED = 3
+
+
 def uncentre(
-    T: np.ndarray, to_middle: np.ndarray, from_middle: np.ndarray
+    T: np.ndarray,
+    to_middle: np.ndarray,
+    from_middle: np.ndarray,
+    scaled: bool = False,
 ) -> np.ndarray:
     """Motions between centred scans as motions between the scans themselves.
 
@@ -28,6 +41,7 @@ def uncentre(
         T: `(b, d+1, d+1)` maps one centred frame into another.
         to_middle: `(b, d)` or `(d,)` middle of the scan that it maps to.
         from_middle: `(b, d)` or `(d,)` middle of the scan that it maps from.
+        scaled: whether rotations are times a factor, which they keep.
 
     Returns:
         `(b, d+1, d+1)` float64, the rotations orthonormal to float64; NaN where `T` is
@@ -36,8 +50,10 @@ def uncentre(
     out = np.array(T, dtype=np.float64)
     finite = np.isfinite(out).all(axis=(1, 2))
     out[~finite] = np.eye(out.shape[-1])
-    U, _, Vt = np.linalg.svd(out[:, :-1, :-1])
+    U, sizes, Vt = np.linalg.svd(out[:, :-1, :-1])
     R = U @ Vt
+    if scaled:
+        R *= sizes.mean(axis=1)[:, None, None]
     out[:, :-1, :-1] = R
     turned = np.einsum(
         "bij,bj->bi", R, np.broadcast_to(from_middle, out[:, :-1, -1].shape)
@@ -54,8 +70,11 @@ def write_files(
     errors: dict[str, Any] | None = None,
     modes: tuple[np.ndarray, ...] | None = None,
     covariances: np.ndarray | None = None,
-) -> None:
+    read: Scans | None = None,
+) -> Result:
     """Writes all files of a result into the folder of `--out`, or none.
+
+    Where no two scans are joined the picture and the page show the likeliest pair.
 
     Args:
         session: the command.
@@ -64,13 +83,24 @@ def write_files(
         errors: against a known truth, see `pose_errors`.
         modes: other poses of the second of two scans, for the page.
         covariances: `(v, k, k)` of the poses, for the page.
+        read: where the scans are whole, if they are files.
+
+    Returns:
+        The result, which knows the files of whole scans.
     """
+    shown = result.to_show()
     with result_folder(session.options.out) as staging:
-        with session.timed("write"):
-            figure = draw_reconstruction(
-                scans, result.T_world_i, result.names, result.component
-            )
-            save_figure(staging / "figure.png", figure)
+        if shown is not None:
+            with session.timed("write"):
+                figure = draw_reconstruction(
+                    scans, shown.T_world_i, shown.names, shown.component
+                )
+                save_figure(staging / "figure.png", figure)
+        look = None
+        if isinstance(session.options, ModelOptions) and read is not None:
+            with session.timed("write"):
+                look = look_of(read, session.options) if result.believed else None
+                result = _with_aligned(session.options, staging, result, read)
         document = result_document(
             result,
             command=session.command,
@@ -78,17 +108,40 @@ def write_files(
             times={k: round(v, 3) for k, v in session.times.items()},
             errors=errors,
         )
-        write_result(staging, result, scans, document)
+        if isinstance(session.options, Register):
+            T = result.T_file[1]
+            document["T_target_source"] = T.tolist() if result.believed else None
+        write_result(staging, result, scans, document, look)
+        if shown is None:
+            return result
         with page_or_message(session):
             write_report(
                 staging / "report.html",
                 scans,
-                result,
+                shown,
                 modes=modes,
                 covariances=covariances,
                 errors=errors,
                 details=page_details(session, document),
             )
+    return result
+
+
+def _with_aligned(
+    options: ModelOptions, staging: Path, result: Result, read: Scans
+) -> Result:
+    """The result, its scans written whole: folders aligned, aligned_1, ..."""
+    if not (options.save_aligned and result.believed):
+        return result
+    names: list[str] = []
+    for k in range(result.num_components):
+        ids = np.flatnonzero(result.component == k)
+        folder = staging / (f"aligned_{k}" if k else "aligned")
+        folder.mkdir()
+        motions = {int(i): result.T_file[i] for i in ids}
+        written = write_aligned(folder, read.files, motions)
+        names += [f"{folder.name}/{name}" for name in written]
+    return dataclasses.replace(result, aligned=tuple(names))
 
 
 @contextlib.contextmanager
@@ -164,11 +217,11 @@ def show_scans(session: Session, result: Result) -> None:
         overlap = "" if row is None else f"{result.overlap[row]:.2f}"
         status = Status(int(result.scan_status[i])).name
         table.add_row(
-            name,
+            printable(name),
             f"{result.num_points[i]:,}",
             f"{result.num_dropped[i]:,}",
             status + _whereabouts(int(result.component[i])),
-            pair,
+            printable(pair),
             overlap,
         )
     session.console.print(table)
@@ -183,7 +236,7 @@ def show_scans(session: Session, result: Result) -> None:
             "other, but not the others: a model of its own."
         )
     if result.status != Status.CONVERGED:
-        session.console.print(result.status.advice)
+        session.console.print(terminal_advice(result.status))
 
 
 def _whereabouts(component: int) -> str:
@@ -200,7 +253,7 @@ def show_errors(session: Session, errors: dict[str, Any]) -> None:
     table.add_column("e_t [mm]", justify="right")
     keys = ("names", "component", "e_R", "e_t")
     for name, k, e_R, e_t in zip(*(errors[key] for key in keys), strict=True):
-        where = f"{name}{_whereabouts(k)}"
+        where = f"{printable(name)}{_whereabouts(k)}"
         table.add_row(where, f"{e_R:.5f}", f"{1e3 * e_t:.3f}")
     table.add_section()
     table.add_row(
@@ -209,9 +262,27 @@ def show_errors(session: Session, errors: dict[str, Any]) -> None:
     session.console.print(table)
 
 
+def tell_failure(session: Session, result: Result, what: str, status: Status) -> int:
+    """Says on standard error that nothing is believed; returns the exit code.
+
+    Args:
+        session: the command.
+        result: whose files are written.
+        what: the scans, for the message.
+        status: why.
+    """
+    page = session.options.out / "report.html"
+    look = f"\nThe best attempt, to look at: {page}" * page.exists()
+    sys.stderr.write(f"jaxreg: {printable(what)}.\n{terminal_advice(status)}{look}\n")
+    return NOT_BELIEVED
+
+
 def show_end(session: Session, files: Sequence[str], folder: Path) -> None:
     """Prints what took how long and what was written, of the files there may be."""
     files = [name for name in files if (folder / name).exists()]
+    whole = [name.partition("/")[0] for name in files if "/" in name]
+    files = [name for name in files if "/" not in name]
+    files += [f"{name}/ ({whole.count(name)} files)" for name in dict.fromkeys(whole)]
     parts = ", ".join(f"{name} {s:.1f} s" for name, s in session.times.items())
     session.console.print(f"Times: {parts}.")
     session.console.print(f"Written to {folder}: {', '.join(files)}.")

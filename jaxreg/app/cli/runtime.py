@@ -24,6 +24,7 @@ import jaxreg
 from jaxreg._core.typing import Progress as ProgressCall
 from jaxreg.app.cli.options import Options, SearchOptions
 from jaxreg.io.errors import InputError
+from jaxreg.io.printable import printable
 
 
 _CACHE_TROUBLE = re.compile("Error (reading|writing) persistent compilation cache")
@@ -65,6 +66,14 @@ def method_of(options: SearchOptions) -> jaxreg.ParticleFilter:
     )
 
 
+class _SafeConsole(Console):
+    """Names of files cannot steer the terminal."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        safe = (printable(x) if isinstance(x, str) else x for x in objects)
+        super().print(*safe, **options)
+
+
 class Session:
     """One run of a command: where it writes to, and how long its parts took."""
 
@@ -72,7 +81,7 @@ class Session:
         self.options = options
         self.command = command
         self.times: dict[str, float] = {}
-        self.console = Console(
+        self.console = _SafeConsole(
             quiet=options.quiet or options.json, highlight=False, markup=False
         )
 

@@ -79,7 +79,8 @@ def write_report(
     if covariances is None:
         covariances = covariances_of(solution)
     labels = list(solution.names if names is None else names)
-    data = _page_data(clouds, solution, labels, modes, covariances, errors)
+    told = details is not None and "command" in details
+    data = _page_data(clouds, solution, labels, modes, covariances, errors, told)
     data["details"] = details_entry(details)
     write_page(path, data["title"], data)
 
@@ -104,6 +105,7 @@ def _page_data(
     modes: tuple[np.ndarray, ...] | None,
     covariances: Any,
     errors: Mapping[str, Any] | None,
+    at_terminal: bool,
 ) -> dict[str, Any]:
     """What the page shows, but for how it was made."""
     num = len(result.T_world_i)
@@ -114,9 +116,10 @@ def _page_data(
     pair = len(labels) == 2 and modes is not None
     return {
         "kind": "scans",
-        "title": _title(labels, pair, result.num_components),
+        "title": "Best attempt, not believed: " * result.attempt
+        + _title(labels, pair, result.num_components),
         "dim": clouds[0].shape[1],
-        "status": status_entry(result.status),
+        "status": status_entry(result.status, at_terminal),
         "camera": None if camera is None else camera.tolist(),
         "points": encode_points(points),
         "scans": _scan_rows(result, labels, covariances, errors),

@@ -64,7 +64,8 @@ def write_graph_report(
     edges = _edge_data(graph, solution)
     title = f"{num:,} poses from {int(np.sum(graph.mask)):,} edges"
     poses = _pose_data(solution, before, labels, sigma)
-    how = _solver_data(solution)
+    told = details is not None and "command" in details
+    how = _solver_data(solution, told)
     data = {"kind": "graph", "title": title, "dim": graph.dim, **poses, **edges, **how}
     data["details"] = details_entry(details)
     write_page(path, title, data)
@@ -111,10 +112,12 @@ def _edge_data(
     }
 
 
-def _solver_data(solution: "jaxreg.AveragingSolution") -> dict[str, Any]:
+def _solver_data(
+    solution: "jaxreg.AveragingSolution", at_terminal: bool
+) -> dict[str, Any]:
     """How the method came to rest."""
     return {
-        "status": status_entry(Status(int(solution.status))),
+        "status": status_entry(Status(int(solution.status)), at_terminal),
         "kernel_width": np.asarray(solution.kernel_width, np.float64).tolist(),
         "steps": int(solution.num_steps),
         "residual": float(solution.residual),

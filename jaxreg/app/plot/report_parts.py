@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from jaxreg._core.status import Status
+from jaxreg.app.advice import terminal_advice
 from jaxreg.app.versions import versions
 
 
-def status_entry(status: Status) -> dict[str, str]:
-    """Name and advice."""
-    return {"name": status.name, "advice": status.advice}
+def status_entry(status: Status, at_terminal: bool = False) -> dict[str, str]:
+    """Name and advice, which for commands names options."""
+    advice = terminal_advice(status) if at_terminal else status.advice
+    return {"name": status.name, "advice": advice}
 
 
 def deviations(covariances: Any, num: int) -> np.ndarray:

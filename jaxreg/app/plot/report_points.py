@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxreg.app.result import merge_scans
+from jaxreg.app.merge import merge_scans
 
 
 MAX_POINTS = 110_000

@@ -39,14 +39,12 @@ def read_e57(
     with reading(path, "E57"):
         size = path.stat().st_size
         with pye57.E57(str(path)) as file:
-            for k in range(file.scan_count):
+            for k, name in enumerate(scan_names(file)):
                 header = file.get_header(k)
                 if header.point_count > 8 * size:  # not a bit each
                     raise ValueError(f"{header.point_count} points in {size} bytes")
                 every = step(max(header.point_count, 1))
                 points = _some_points(pye57, file, header, every)
-                name = _name(header, k)
-                name = f"{name}-{k}" if name in scans else name
                 scans[name] = points, tuple(header.point_fields), every
         if not scans:
             raise ValueError("no scans")
@@ -54,6 +52,35 @@ def read_e57(
         name: (as_points(points, f"{path}:{name}"), fields, every)
         for name, (points, fields, every) in scans.items()
     }
+
+
+def scan_names(file: Any) -> list[str]:
+    """Of the scans of an open file, as `read_e57` calls them."""
+    names: list[str] = []
+    for k in range(file.scan_count):
+        name = _name(file.get_header(k), k)
+        names.append(f"{name}-{k}" if name in names else name)
+    return names
+
+
+def read_columns(
+    path: Path, key: str | None, names: list[str], every: int
+) -> list[np.ndarray]:
+    """Fields of one of so many points of a scan, the first one without a name."""
+    pye57 = require("pye57", "Reading E57")
+    parts, found = [], 0
+    with pye57.E57(str(path)) as file:
+        known = scan_names(file)
+        header = file.get_header(known.index(key) if key in known else 0)
+        flags = [f for f in header.point_fields if f.endswith("InvalidState")]
+        data, buffers = file.make_buffers([*names, *flags[:1]], _CHUNK)
+        chunks = header.points.reader(buffers)
+        while count := chunks.read():
+            rows = slice(-found % every, count, every)
+            found += count
+            valid = data[flags[0]][rows] == 0 if flags else slice(None)
+            parts.append([data[name][rows][valid].copy() for name in names])
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
 
 def _some_points(pye57: Any, file: Any, header: Any, every: int) -> np.ndarray:

@@ -60,6 +60,20 @@ def parse_las(
     return as_points(points, str(path)), fields, every
 
 
+def read_columns(
+    data: bytes | None, path: Path, names: list[str], every: int
+) -> list[np.ndarray]:
+    """Dimensions of one of so many points, in their types."""
+    laspy = require("laspy", "Reading LAS and LAZ")
+    found, parts = 0, []
+    with laspy.open(path if data is None else io.BytesIO(data)) as file:
+        for chunk in file.chunk_iterator(_CHUNK):
+            first = -found % every
+            parts.append([np.array(chunk[name])[first::every] for name in names])
+            found += len(chunk)
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+
 def _check_header(file: io.BufferedIOBase, size: int) -> None:
     """Compares the counts of the header with the size of the file.
 

@@ -28,7 +28,7 @@ _WORDS = (
 OF_POSES = {
     ".g2o": ("a pose graph", "jaxreg average or jaxreg.io.read_g2o"),
     ".graph": ("a pose graph", "jaxreg.io.read_toro"),
-    ".log": ("motions or poses", "jaxreg.io.read_log"),
+    ".log": ("motions or poses", "jaxreg average or jaxreg.io.read_log"),
     ".info": ("information matrices", "jaxreg.io.read_info"),
     ".conf": ("poses of scans", "jaxreg.io.read_conf or --truth"),
     ".tum": ("a trajectory", "jaxreg.io.read_tum"),
@@ -56,7 +56,7 @@ def require_points(lines: Sequence[str], path: Path) -> None:
         return
     widths = [len(row) for row in rows]
     for size, what, reader in (
-        (4, "motions of fragments", "jaxreg.io.read_log (.log)"),
+        (4, "motions of fragments", "jaxreg average or jaxreg.io.read_log (.log)"),
         (6, "information matrices", "jaxreg.io.read_info (.info)"),
     ):
         block = [3] + [size] * size

@@ -44,7 +44,7 @@ def parse_pcd(
     size = path.stat().st_size if data is None else len(data)
     with reading(path, "PCD"):
         with path.open("rb") if data is None else io.BytesIO(data) as file:
-            header = pypcd4.MetaData.parse_header(_header(file))
+            header = pypcd4.MetaData.parse_header(header_lines(file))
             _check_header(pypcd4, header, file, size)
             fields = tuple(header.fields)
             names = ["x", "y", "z"] if "z" in fields else ["x", "y"]
@@ -55,7 +55,17 @@ def parse_pcd(
     return as_points(np.stack(columns, axis=1), str(path)), fields, every
 
 
-def _header(file: Any) -> list[str]:
+def read_columns(
+    data: bytes | None, path: Path, names: list[str], every: int
+) -> list[np.ndarray]:
+    """Fields of one of so many points, in their types."""
+    pypcd4 = require("pypcd4", "Reading PCD")
+    with path.open("rb") if data is None else io.BytesIO(data) as file:
+        header = pypcd4.MetaData.parse_header(header_lines(file))
+        return _columns(pypcd4, file, header, names, every)
+
+
+def header_lines(file: Any) -> list[str]:
     """Its lines; the data begin after them."""
     lines: list[str] = []
     for _ in range(100):

@@ -38,12 +38,9 @@ def parse_ply(
         with path.open("rb") if data is None else io.BytesIO(data) as file:
             header = read_header(file, size)
             before, vertex = header.before_and_vertex()
-            names = _coordinates(vertex)
+            names = coordinates(vertex)
             every = step(max(vertex.num, 1))
-            if header.order:
-                columns = _binary_columns(path, data, header, names, every)
-            else:
-                columns = _text_columns(file, header, names, every)
+            columns = _columns(file, path, data, header, names, every)
     if len(columns[0]) == 0:
         raise InputError(f"{path}: holds no points.\nExport or copy the scan again.")
     types = {p.name: np.dtype(p.type) for p in vertex.properties}
@@ -52,7 +49,34 @@ def parse_ply(
     return points, tuple(types), every
 
 
-def _coordinates(vertex: Element) -> list[str]:
+def read_columns(
+    data: bytes | None, path: Path, names: list[str], every: int
+) -> list[np.ndarray]:
+    """Properties of one of so many vertices, in their types; text as float64."""
+    size = path.stat().st_size if data is None else len(data)
+    with path.open("rb") if data is None else io.BytesIO(data) as file:
+        return _columns(file, path, data, read_header(file, size), names, every)
+
+
+def _columns(
+    file: io.BufferedIOBase,
+    path: Path,
+    data: bytes | None,
+    header: Header,
+    names: list[str],
+    every: int,
+) -> list[np.ndarray]:
+    if header.order:
+        return _binary_columns(path, data, header, names, every)
+    return _text_columns(file, header, names, every)
+
+
+def coordinates(vertex: Element) -> list[str]:
+    """The names of the coordinates of vertices.
+
+    Raises:
+        ValueError: if they have no x and y, or lists in their place.
+    """
     found = {p.name: p for p in vertex.properties}
     names = ["x", "y", "z"] if "z" in found else ["x", "y"]
     missing = [name for name in names if name not in found or found[name].length]

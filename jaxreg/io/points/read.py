@@ -15,6 +15,7 @@ from jaxreg.io.points import arrays, e57, las, meshes, pcd, ply, text
 from jaxreg.io.points.content import require_suffix
 from jaxreg.io.points.other_text import OF_POSES, refusal
 from jaxreg.io.points.thinning import Step, at_most, every_row, text_step
+from jaxreg.io.printable import printable
 
 
 TEXT = (".xyz", ".csv", ".txt", ".pts", ".asc")
@@ -80,7 +81,7 @@ def read_points(path: str | Path) -> np.ndarray:
         MissingExtraError: if the package of the extra `formats` that reads this kind is
             not installed.
     """
-    bare, key = _split_key(path)
+    bare, key = split_key(path)
     scans = read_named(path)
     if len(scans) > 1:
         raise InputError(
@@ -98,8 +99,8 @@ def read_scans(
     Args:
         paths: each is a file as for `read_points`, an NPZ or E57 file of which every
             scan is read, or a folder, of which all point files are read in natural
-            order (`scan2` before `scan10`). Of text files there without numbers, such
-            as a readme, a warning tells that they are skipped.
+            order (`scan2` before `scan10`). Of text files there without points, such
+            as a readme or poses, a warning tells that they are skipped.
 
     Returns:
         Names, made of file names without suffix or NPZ keys and unique, and as many
@@ -134,13 +135,13 @@ def read_named(
     Raises:
         InputError: as `read_points`.
     """
-    bare, key = _split_key(path)
-    if _suffix(bare) not in ARCHIVES:
+    bare, key = split_key(path)
+    if suffix_of(bare) not in ARCHIVES:
         return {stem(bare): _read_file(bare, max_points)}
     step = every_row if max_points is None else at_most(max_points)
     found = _read_archive(bare, step)
     scans = {name: _thinned(scan, max_points) for name, scan in found.items()}
-    if key is None and len(scans) == 1 and _suffix(bare) == ".e57":
+    if key is None and len(scans) == 1 and suffix_of(bare) == ".e57":
         return {stem(bare): next(iter(scans.values()))}  # scanners name all alike
     if key is not None and key not in scans:
         raise InputError(f"{bare}: has no scan {key}.\nIt holds: {_listing(scans)}.")
@@ -150,8 +151,7 @@ def read_named(
 def point_files(path: str | Path) -> list[Path]:
     """The point files of a folder in natural order; a file stands for itself.
 
-    Text files without a row of numbers, such as a readme, are left out, see
-    `prose_files`.
+    Text files of something else, such as a readme, are left out, see `prose_files`.
 
     Raises:
         InputError: if a folder holds no point file.
@@ -169,15 +169,20 @@ def point_files(path: str | Path) -> list[Path]:
 
 
 def prose_files(path: str | Path) -> list[Path]:
-    """The text files of a folder that hold no row of numbers; none of a file.
+    """The text files of a folder that are none of points; none of a file.
+
+    Those that are not rows of numbers, such as a readme, and those that plainly hold
+    poses or a graph. An empty one counts if it ends in `.txt`; with another suffix it
+    may be a scan that was not exported whole.
 
     Raises:
         InputError: if the folder cannot be read.
     """
     if not Path(path).is_dir():
         return []
-    found = [f for f in _candidates(Path(path)) if _suffix(f) in TEXT]
-    return [f for f in found if not text.has_rows(text_lines(f))]
+    found = [f for f in _candidates(Path(path)) if suffix_of(f) in TEXT]
+    found = [f for f in found if f.stat().st_size or suffix_of(f) == ".txt"]
+    return [f for f in found if not text.may_be_points(text_lines(f), f)]
 
 
 def _candidates(folder: Path) -> list[Path]:
@@ -186,7 +191,7 @@ def _candidates(folder: Path) -> list[Path]:
         files = [
             f
             for f in folder.iterdir()
-            if f.is_file() and not f.name.startswith(".") and _suffix(f) in SUFFIXES
+            if f.is_file() and not f.name.startswith(".") and suffix_of(f) in SUFFIXES
         ]
     return sorted(files, key=lambda f: _natural(f.name))
 
@@ -202,8 +207,8 @@ def stem(path: str | Path) -> str:
 
 
 def _read_file(path: Path, max_points: int | None) -> NamedPoints:
-    suffix = _suffix(path)
-    _require_known(path, suffix)
+    suffix = suffix_of(path)
+    require_known(path, suffix)
     if suffix in TEXT:
         # Of packed text always: it is unpacked in no time, but parsed in much.
         step = text_step(path) if max_points is not None or is_packed(path) else 1
@@ -226,14 +231,14 @@ def _thinned(scan: NamedPoints, max_points: int | None) -> NamedPoints:
 
 
 def _read_archive(path: Path, step: Step) -> dict[str, NamedPoints]:
-    suffix = _suffix(path)
-    _require_known(path, suffix)
+    suffix = suffix_of(path)
+    require_known(path, suffix)
     with reading(path, suffix[1:].upper()):
         found = _ARCHIVE_READERS[suffix](path, step)
     return {name: NamedPoints(*scan) for name, scan in found.items()}
 
 
-def _require_known(path: Path, suffix: str) -> None:
+def require_known(path: Path, suffix: str) -> None:
     """Refuses what is no file of points before it is read.
 
     Raises:
@@ -260,12 +265,14 @@ def _unpacked(path: Path) -> bytes:
         return file.read()
 
 
-def _split_key(path: str | Path) -> tuple[Path, str | None]:
+def split_key(path: str | Path) -> tuple[Path, str | None]:
+    """The file and the key of `FILE.npz:KEY`; None without one."""
     match = re.fullmatch(r"(.*\.(?:npz|e57)):([^/\\]+)", str(path), re.IGNORECASE)
     return (Path(match[1]), match[2]) if match else (Path(path), None)
 
 
-def _suffix(path: Path) -> str:
+def suffix_of(path: Path) -> str:
+    """In lower case, that within of a packed file: `.ply` of `A.PLY.gz`."""
     name = path.name.lower()
     packed = name.endswith(".gz")
     suffix = Path(name[:-3] if packed else name).suffix
@@ -278,10 +285,10 @@ def _natural(name: str) -> list[tuple[int, int | str]]:
 
 
 def unique_names(names: list[str]) -> list[str]:
-    """The same names, later ones of a kind with -2, -3 and so on appended."""
+    """The same names, printable, later ones of a kind with -2, -3 ... appended."""
     seen: dict[str, int] = {}
     out: list[str] = []
-    for name in names:
+    for name in map(printable, names):
         seen[name] = seen.get(name, 0) + 1
         out.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
     return out

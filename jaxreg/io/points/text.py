@@ -5,7 +5,7 @@ file nor what to do.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ _LOOK = 50  # rows that the layout is read from
 Line = tuple[int, str]
 
 
-class _Layout(NamedTuple):
+class Layout(NamedTuple):
     """What the first lines say.
 
     Attributes:
@@ -85,13 +85,44 @@ def parse_text(
     return points, layout.fields
 
 
-def has_rows(lines: Iterable[Line]) -> bool:
-    """Whether one of the first lines holds two numbers, or they are no text at all."""
+def rows_from(lines: Iterable[Line], path: Path) -> tuple[Layout, int, list[str]]:
+    """The layout of a text file, the number of its first row, and the first rows.
+
+    Raises:
+        InputError: as `parse_text`.
+    """
+    layout, rows = _layout(*_first_lines(iter(lines)), path)
+    return layout, rows[0][0], [line for _, line in rows]
+
+
+def may_be_points(lines: Iterable[Line], path: Path) -> bool:
+    """Whether half of the first lines have numbers, not plainly of poses or a graph.
+
+    True also of what is no text at all: the reader says what is wrong.
+    """
     try:
         found, _ = _first_lines(iter(lines))
     except InputError:
-        return True  # the reader says what is wrong
-    return not found or any(_has_numbers(line) for _, line in found)
+        return True
+    try:
+        require_points([line for _, line in found], path)
+    except InputError:
+        return False
+    numbers = sum(_has_numbers(line) for _, line in found)
+    return 0 < len(found) <= 2 * numbers
+
+
+def parse_columns(
+    lines: Iterable[Line], path: Path, names: Sequence[str], step: int
+) -> np.ndarray:
+    """The columns of these names, `(n, k)` float64, of one of so many rows."""
+    lines = iter(lines)
+    layout, first = _layout(*_first_lines(lines), path)
+    layout = layout._replace(columns=[layout.fields.index(name) for name in names])
+    rest = (line for line in lines if line[1].strip() and not is_comment(line[1]))
+    kept = itertools.islice(itertools.chain(first, rest), 0, None, step)
+    rows = [_parse_row(line, layout, path) for line in kept]
+    return np.array(rows, np.float64).reshape(-1, len(names))
 
 
 class _Counted:
@@ -127,7 +158,7 @@ def _first_lines(lines: Iterator[Line]) -> tuple[list[Line], list[str]]:
 
 def _layout(
     lines: list[Line], heads: list[str], path: Path
-) -> tuple[_Layout, list[Line]]:
+) -> tuple[Layout, list[Line]]:
     """What the lines say, and those that are rows."""
     require_points([line for _, line in lines], path)
     count: int | None = None
@@ -160,7 +191,7 @@ def _layout(
     columns, fields = coordinates(names, numeric, len(rows[0]), path)
     _require_first_row(rows, columns, lines, path)
     needed = max(numeric) + 1
-    return _Layout(dialect, columns, fields, len(rows[0]), needed, count), lines
+    return Layout(dialect, columns, fields, len(rows[0]), needed, count), lines
 
 
 def _has_numbers(line: str) -> bool:
@@ -198,7 +229,7 @@ def _require_first_row(
             )
 
 
-def _parse_row(line: Line, layout: _Layout, path: Path) -> list[float]:
+def _parse_row(line: Line, layout: Layout, path: Path) -> list[float]:
     number, text = line
     cells = layout.dialect.cells(text)
     try:
@@ -215,7 +246,7 @@ def _parse_row(line: Line, layout: _Layout, path: Path) -> list[float]:
         ) from err
 
 
-def _require_width(cells: list[str], layout: _Layout) -> None:
+def _require_width(cells: list[str], layout: Layout) -> None:
     """Rows may differ in words behind the numbers, not in numbers.
 
     Raises:

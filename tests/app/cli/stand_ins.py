@@ -152,7 +152,7 @@ def registered(T: np.ndarray, status: int, overlap: float) -> Any:
 
 
 def register_s1_onto_s0(
-    source: np.ndarray, target: np.ndarray, method: Any, *, key: Any
+    source: np.ndarray, target: np.ndarray, method: Any, *, key: Any, init: Any = None
 ) -> Any:
     assert np.isfinite(source).all()
     T = shift(-np.median(CLOUD, axis=0)) @ POSES[1] @ shift(middle_of(POSES[1]))

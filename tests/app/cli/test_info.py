@@ -145,17 +145,21 @@ def test_map_coordinates_in_float32_are_warned_of(
         ("a.g2o.gz", b"not packed", "a.g2o.gz: cannot be read"),
     ],
 )
-def test_a_wrong_file_is_named_and_nothing_else_said(
+def test_a_wrong_file_is_named_and_the_others_are_told(
     capsys: pytest.CaptureFixture[str], name: str, content: bytes | None, said: str
 ):
     np.save("good.npy", GRID)
     if content is not None:
         Path(name).write_bytes(content)
-    assert main(["info", "good.npy", name]) == 2
+    assert main(["info", name, "good.npy"]) == 2
     captured = capsys.readouterr()
-    assert captured.out == ""
+    assert "good.npy: 3D scan" in captured.out
     assert said in captured.err
     assert len(captured.err.splitlines()) <= 2
+    assert main(["info", name, "good.npy", "--json"]) == 2
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert [f["file"] for f in files] == ["good.npy", name]
+    assert said in files[1]["error"]
 
 
 def test_no_file_at_all(capsys: pytest.CaptureFixture[str]):

@@ -16,7 +16,6 @@ from tests.app.cli.stand_ins import (
     FILES,
     POSES,
     fake_reconstruct,
-    left,
     save_scans,
     seen_from,
     shift,
@@ -177,17 +176,19 @@ def test_errors_of_a_second_object_are_told(
     assert "t1, component 1" in capsys.readouterr().out
 
 
-def test_scans_without_overlap_are_named_and_nothing_is_written(
+def test_scans_without_overlap_are_named_and_can_be_looked_at(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     scans = save_scans(folder)[:2]
     fake_reconstruct(monkeypatch, POSES, [True, False])
-    before = left(folder)
-    assert main(["multiview", *scans]) == 2
+    assert main(["multiview", *scans]) == 3
     message = capsys.readouterr().err
     assert "s0.npy and s1.npy: no two scans could be joined" in message
-    assert len(message.splitlines()) == 2
-    assert left(folder) == before
+    assert len(message.splitlines()) == 3
+    found = sorted(os.listdir("jaxreg-out"))
+    assert found == ["figure.png", "report.html", "result.json"]
+    page = Path("jaxreg-out/report.html").read_text()
+    assert "Best attempt, not believed: 2 scans in one frame" in page
 
 
 def test_dropped_rows_are_counted(

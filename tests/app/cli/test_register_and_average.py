@@ -13,13 +13,14 @@ import jaxreg
 from jaxreg import Status
 from jaxreg.app.cli.main import main
 from tests.app.cli.stand_ins import (
+    CLOUD,
     FILES,
     GRAPH,
     POSES,
-    left,
     register_s1_onto_s0,
     registered,
     save_scans,
+    shift,
 )
 
 
@@ -34,6 +35,7 @@ def test_register_writes_the_motion_between_the_files(
     found = json.loads(Path("jaxreg-out/result.json").read_text())
     assert found["names"] == ["s0", "s1"]
     np.testing.assert_allclose(found["T_world_i"][1], POSES[1], atol=2e-6)
+    assert found["T_target_source"] == found["T_world_i"][1]
     assert "overlap 0.930" in capsys.readouterr().out
 
 
@@ -62,25 +64,149 @@ def test_a_position_is_that_of_the_origin_in_the_target(
     assert "--position: wanted 3 finite numbers" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("status", [Status.LOW_OVERLAP, Status.NON_FINITE])
-def test_register_without_overlap_exits_with_2(
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    status: Status,
-):
-    save_scans(folder)
-
+def _fails(monkeypatch: pytest.MonkeyPatch, T: np.ndarray, status: Status) -> None:
     def register(source: np.ndarray, target: np.ndarray, method: Any, **_: Any) -> Any:
-        return registered(np.full((4, 4), np.nan), status, 0.0)
+        return registered(T, status, 0.2 if np.isfinite(T).all() else 0.0)
 
     monkeypatch.setattr(jaxreg, "register", register)
-    before = left(folder)
-    assert main(["register", "s1.npy", "s0.npy"]) == 2
+
+
+def test_a_pose_that_is_not_believed_exits_with_3_and_can_be_looked_at(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    save_scans(folder)
+    _fails(monkeypatch, shift(np.ones(3)), Status.LOW_OVERLAP)
+    assert main(["register", "s1.npy", "s0.npy", "--json"]) == 3
+    told = capsys.readouterr()
+    assert "s1.npy onto s0.npy: LOW_OVERLAP" in told.err
+    assert "--budget" in told.err
+    assert "`" not in told.err
+    assert "jaxreg-out/report.html" in told.err
+    found = json.loads(told.out)
+    assert (found["status"], found["T_world_i"][1]) == ("LOW_OVERLAP", None)
+    # Nothing is written that another program would take for an answer.
+    assert sorted(os.listdir("jaxreg-out")) == [
+        "figure.png",
+        "report.html",
+        "result.json",
+    ]
+    assert "Best attempt, not believed: s1 onto s0" in (
+        Path("jaxreg-out/report.html").read_text()
+    )
+
+
+def test_without_any_pose_the_result_alone_says_why(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    save_scans(folder)
+    _fails(monkeypatch, np.full((4, 4), np.nan), Status.NON_FINITE)
+    assert main(["register", "s1.npy", "s0.npy"]) == 3
     message = capsys.readouterr().err
-    assert f"s1.npy onto s0.npy: {status.name}" in message
+    assert "s1.npy onto s0.npy: NON_FINITE" in message
     assert len(message.splitlines()) == 2
-    assert left(folder) == before
+    assert os.listdir("jaxreg-out") == ["result.json"]
+
+
+def _given_init(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    given = []
+
+    def register(source: Any, target: Any, method: Any, **rest: Any) -> Any:
+        given.append((rest.get("init"), method))
+        return register_s1_onto_s0(source, target, method, **rest)
+
+    save_scans(folder)
+    monkeypatch.setattr(jaxreg, "register", register)
+    return given
+
+
+@pytest.mark.parametrize("kind", ["numbers", "rows", "text", "npy", "json"])
+def test_a_guess_is_between_the_frames_of_the_files(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+):
+    given = _given_init(folder, monkeypatch)
+    numbers = " ".join(map(repr, POSES[1].ravel().tolist()))
+    rows = ",".join(map(repr, POSES[1][:3].ravel().tolist()))
+    np.savetxt("guess.txt", POSES[1])
+    np.save("guess.npy", POSES[1])
+    poses = np.stack([POSES[2], POSES[2] @ POSES[1]]).tolist()
+    document = {"names": ["s0", "s1"], "T_world_i": poses}
+    Path("result.json").write_text(json.dumps(document))
+    files = {"text": "guess.txt", "npy": "guess.npy", "json": "result.json"}
+    init = {"numbers": numbers, "rows": rows, **files}[kind]
+    run = ["register", "s1.npy", "s0.npy", "--method", "icp", "--init", init]
+    assert main([*run, "--max-distance", "0.5"]) == 0
+    T, method = given[0]
+    middles = [np.median(np.load(f"s{k}.npy"), axis=0) for k in (0, 1)]
+    back = shift(middles[0]) @ T @ shift(-middles[1])
+    np.testing.assert_allclose(back, POSES[1], atol=1e-6)
+    assert isinstance(method, jaxreg.ICP)
+    assert float(jnp.asarray(method.max_correspondence_distance)) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--scale"], "--scale: only with --method icp"),
+        (["--method", "icp", "--upright"], "--upright: only with --method filter"),
+        (["--max-distance", "1"], "--max-distance: only with --method icp"),
+        (["--method", "icp", "--max-distance", "-1"], "wanted a number above zero"),
+        (["--init", "1 2 3"], "wanted 16 finite numbers, found 3"),
+        (["--init", "none.txt"], "none.txt: no such file"),
+        (["--init", "2 0 0 0 0 2 0 0 0 0 2 0"], "not orthonormal"),
+        (["--init", "other.json"], "holds no poses of s0 and s1"),
+    ],
+)
+def test_options_of_a_pair_that_cannot_be_used_are_named(
+    folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], told: str
+):
+    save_scans(folder)
+    document = {"names": ["a", "b"], "T_world_i": POSES[:2].tolist()}
+    Path("other.json").write_text(json.dumps(document))
+    assert main(["register", "s1.npy", "s0.npy", *options]) == 2
+    message = capsys.readouterr().err
+    assert told in message
+    assert len(message.splitlines()) <= 2
+
+
+def test_units_are_those_of_the_files_in_json_and_of_the_target_in_points(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    given = _given_init(folder, monkeypatch)
+    np.save("mm.npy", 1000 * np.load("s1.npy"))
+    run = ["register", "mm.npy", "s0.npy", "--unit", "mm", "m"]
+    guess = POSES[1] @ np.diag([0.001, 0.001, 0.001, 1])
+    assert main([*run, "--init", " ".join(map(str, guess.ravel()))]) == 0
+    np.testing.assert_allclose(np.linalg.det(given[0][0]), 1, atol=1e-5)
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    T = np.array(found["T_world_i"][1])
+    np.testing.assert_allclose(T, guess, atol=2e-6)
+    moved = np.load("mm.npy") @ T[:3, :3].T + T[:3, 3]
+    np.testing.assert_allclose(moved, CLOUD, atol=1e-5)
+    merged = jaxreg.io.read_points("jaxreg-out/merged.ply")
+    np.testing.assert_allclose(merged[40:], CLOUD, atol=1e-5)
+    _, poses = jaxreg.io.read_tum("jaxreg-out/poses.tum")
+    np.testing.assert_allclose(poses[1], POSES[1], atol=1e-5)
+
+
+def test_a_scale_that_is_found_stays_in_the_motion(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    save_scans(folder)
+    np.save("half.npy", 0.5 * np.load("s1.npy"))
+    middles = [np.median(np.load(f), axis=0) for f in ("s0.npy", "half.npy")]
+    T = POSES[1] @ np.diag([2.0, 2, 2, 1])
+
+    def register(source: Any, target: Any, method: Any, **_: Any) -> Any:
+        assert method.with_scale
+        return registered(shift(-middles[0]) @ T @ shift(middles[1]), 0, 0.9)
+
+    monkeypatch.setattr(jaxreg, "register", register)
+    run = ["register", "half.npy", "s0.npy", "--method", "icp", "--scale"]
+    assert main(run) == 0
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    np.testing.assert_allclose(found["T_world_i"][1], T, atol=5e-6)
+    merged = jaxreg.io.read_points("jaxreg-out/merged.ply")
+    np.testing.assert_allclose(merged[40:], CLOUD, atol=1e-5)
 
 
 def test_average_lowers_the_objective(folder: Path, capsys: pytest.CaptureFixture[str]):
@@ -92,3 +218,13 @@ def test_average_lowers_the_objective(folder: Path, capsys: pytest.CaptureFixtur
     assert found["names"] == [0, 1, 2]
     assert np.shape(found["T_world_i"]) == (3, 3, 3)
     assert "objective" in capsys.readouterr().out
+
+
+def test_average_reads_the_motions_of_fragments(folder: Path):
+    edges = [(0, 1), (1, 2), (0, 2)]
+    T = [np.linalg.inv(POSES[i]) @ POSES[j] for i, j in edges]
+    jaxreg.io.write_log("g.log", jaxreg.PoseGraph.from_edges(edges, np.stack(T)))
+    assert main(["average", "g.log", "--method", "plain", "--quiet"]) == 0
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    np.testing.assert_allclose(found["T_world_i"], POSES, atol=1e-5)
+    assert found["names"] == [0, 1, 2]

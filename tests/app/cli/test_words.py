@@ -7,13 +7,17 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 
 import jaxreg
+from jaxreg import app
 from jaxreg.app.cli.main import main
 from jaxreg.app.cli.options import SearchOptions
+from jaxreg.app.result import RESULT_FORMAT
 from jaxreg.io import MissingExtraError
 from tests.app.cli.stand_ins import (
     CLOUD,
@@ -27,6 +31,11 @@ from tests.app.cli.stand_ins import (
 )
 
 
+SCHEMA = jsonschema.Draft202012Validator(
+    json.loads(Path(app.__file__).with_name("result.schema.json").read_text())
+)
+
+
 @pytest.mark.parametrize(
     "command", ["demo", "register", "multiview", "average", "info"]
 )
@@ -37,7 +46,7 @@ def test_help_tells_the_default_of_every_option(
         main([command, "--help"])
     assert caught.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    options = re.findall(r" (--[a-z]+)(?= )(?:(?! --[a-z]).)*", text.split("exit")[1])
+    options = re.findall(r" (--[a-z-]+)(?= )(?:(?! --[a-z]).)*", text.split("exit")[1])
     assert "--json" in options
     assert len(options) == text.split("exit")[1].count("(default: ")
 
@@ -129,18 +138,21 @@ def test_json_is_all_that_goes_to_standard_output(
     captured = capsys.readouterr()
     found = json.loads(captured.out)
     assert found["status"] == "CONVERGED"
+    SCHEMA.validate(found)
     assert found == json.loads(Path("jaxreg-out/result.json").read_text())
     assert captured.err == ""
 
 
-def test_json_of_a_failure_is_silent_on_standard_output(
+def test_json_of_a_failure_is_still_the_result(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     scans = save_scans(folder)[:2]
     fake_reconstruct(monkeypatch, POSES, [True, False])
-    assert main(["multiview", *scans, "--json"]) == 2
+    assert main(["multiview", *scans, "--json"]) == 3
     captured = capsys.readouterr()
-    assert captured.out == ""
+    found = json.loads(captured.out)
+    assert found["T_world_i"][1] is None
+    SCHEMA.validate(found)
     assert "no two scans could be joined" in captured.err
 
 
@@ -190,3 +202,26 @@ def test_help_and_facts_of_a_scan_load_no_jax(folder: Path):
 
 def test_the_budget_that_help_tells_is_that_of_the_search():
     assert SearchOptions().budget == jaxreg.ParticleFilter().num_prior
+
+
+def test_the_schema_knows_every_status_and_no_other_format():
+    told: Any = SCHEMA.schema
+    assert told["$defs"]["status"]["enum"] == [s.name for s in jaxreg.Status]
+    assert told["properties"]["format"] == {"const": RESULT_FORMAT}
+    assert not SCHEMA.is_valid({"status": "CONVERGED"})
+
+
+def test_names_of_files_do_not_steer_the_terminal(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    name = "s\x1b[2J\x9b1A.npy"
+    np.save(folder / name, seen_from(POSES[0]))
+    np.save(folder / "s1.npy", seen_from(POSES[1]))
+    monkeypatch.setattr(jaxreg, "register", register_s1_onto_s0)
+    assert main(["register", "s1.npy", name]) == 0
+    assert main(["info", name]) == 0
+    assert main(["multiview", name]) == 2
+    told = capsys.readouterr()
+    assert not set("\x1b\x9b") & set(told.out + told.err)
+    assert "s\\x1b[2J\\x9b1A" in told.out
+    assert "s\\x1b[2J\\x9b1A.npy: this is one scan alone" in told.err

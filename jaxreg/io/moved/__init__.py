@@ -1,0 +1,1 @@
+"""Files of points written again, moved: one format a file, all else as it was."""
