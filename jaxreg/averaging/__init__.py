@@ -5,6 +5,8 @@ from jaxreg.averaging.base import AbstractAverager as AbstractAverager
 from jaxreg.averaging.base import AveragingSolution as AveragingSolution
 from jaxreg.averaging.base import solution as solution
 from jaxreg.averaging.base import starting_poses as starting_poses
+from jaxreg.averaging.certificate import Certificate as Certificate
+from jaxreg.averaging.certificate import certify as certify
 from jaxreg.averaging.covariance import pose_covariances as pose_covariances
 from jaxreg.averaging.methods.correntropy import Correntropy as Correntropy
 from jaxreg.averaging.methods.low_rank_sparse import LowRankSparse as LowRankSparse
@@ -14,6 +16,9 @@ from jaxreg.averaging.methods.motion_averaging import (
     WeightedMotionAveraging as WeightedMotionAveraging,
 )
 from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM as PoseGraphLM
+from jaxreg.averaging.methods.riemannian_staircase import (
+    RiemannianStaircase as RiemannianStaircase,
+)
 from jaxreg.averaging.methods.shortest_paths import ShortestPaths as ShortestPaths
 from jaxreg.averaging.methods.spanning_tree import SpanningTree as SpanningTree
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus as CycleConsensus

@@ -5,6 +5,7 @@ has not found a negative direction does not. SciPy's SuperLU without pivots is L
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,6 +14,17 @@ import scipy.sparse.linalg as sla
 
 #: Rows, columns and values of some blocks.
 Blocks = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class Factor:
+    """Of a symmetric positive definite matrix."""
+
+    def __init__(self, lu: Any) -> None:
+        self._lu = lu
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        """`(n,)` or `(n, c)`."""
+        return self._lu.solve(rhs)
 
 
 def fill_reducing_order(edges: np.ndarray, num: int) -> np.ndarray:
@@ -60,22 +72,22 @@ def kept_unknowns(order: np.ndarray, size: int, dropped: np.ndarray) -> np.ndarr
     return every[~np.isin(every, dropped)]
 
 
-def definite_factor(matrix: sp.csc_array) -> sla.SuperLU | None:
+def definite_factor(matrix: sp.csc_array) -> Factor | None:
     """The factor of a symmetric matrix if it is positive definite, else None."""
     try:
         factor = _lu(matrix, "NATURAL")
     except RuntimeError:  # a pivot of zero
         return None
-    in_place = np.array_equal(factor.perm_r, np.arange(matrix.shape[0]))
     pivots = factor.U.diagonal()
-    return factor if in_place and np.all(pivots > 0) else None
+    in_place = np.array_equal(factor.perm_r, np.arange(len(pivots)))
+    return Factor(factor) if in_place and np.all(pivots > 0) else None
 
 
 def _places(frame: np.ndarray, inner: np.ndarray) -> np.ndarray:
     return frame[:, None] * len(inner) + inner
 
 
-def _lu(matrix: sp.csc_array, order: str) -> sla.SuperLU:
+def _lu(matrix: sp.csc_array, order: str) -> Any:
     return sla.splu(
         sp.csc_matrix(matrix),
         permc_spec=order,

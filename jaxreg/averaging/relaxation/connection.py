@@ -13,10 +13,11 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as sla
+from scipy.sparse.csgraph import connected_components
 
 from jaxreg.linear.sparse import (
     Blocks,
+    Factor,
     definite_factor,
     fill_reducing_order,
     from_blocks,
@@ -44,6 +45,20 @@ class Connection:
     T_i_j: np.ndarray
     precision: np.ndarray
     num: int
+
+    @classmethod
+    def of(
+        cls,
+        edges: np.ndarray,
+        T_i_j: np.ndarray,
+        weights: tuple[np.ndarray, np.ndarray],
+        num: int,
+    ) -> "Connection":
+        """From kappa `(e,)` and tau `(e,)`, all above 0."""
+        kappa, tau = (np.asarray(w, np.float64)[:, None] for w in weights)
+        d = T_i_j.shape[-1] - 1
+        precision = np.concatenate([np.repeat(kappa, d, axis=1), tau], axis=1)
+        return cls(edges, np.asarray(T_i_j, np.float64), precision, num)
 
     @property
     def dim(self) -> int:
@@ -83,15 +98,22 @@ class Connection:
 
     def objective(self, T_world_i: np.ndarray) -> float:
         """F of poses `(v, d+1, d+1)`."""
-        i, j = self.edges.T
-        gap = (T_world_i[j] - T_world_i[i] @ self.T_i_j)[:, :-1]
-        return float(np.sum(self.precision[:, None, :] * gap**2))
+        return self.cost(lifted(T_world_i))
 
-    def multipliers(self, T_world_i: np.ndarray) -> np.ndarray:
-        """`(v, d, d)` symmetric: at a stationary point, X S = 0."""
+    def pull(self, V: np.ndarray) -> np.ndarray:
+        """The product with M of lifted poses `(v, d+1, r)`."""
+        return (self.matrix @ V.reshape(-1, V.shape[-1])).reshape(V.shape)
+
+    def cost(self, V: np.ndarray) -> float:
+        """F of lifted poses `(v, d+1, r)`."""
+        i, j = self.edges.T
+        gap = V[j] - self.T_i_j.swapaxes(1, 2) @ V[i]
+        return float(np.sum(self.precision[:, :, None] * gap**2))
+
+    def multipliers(self, V: np.ndarray) -> np.ndarray:
+        """`(v, d, d)` symmetric: at stationary lifted poses, X S = 0."""
         d = self.dim
-        pulls = (self.matrix @ columns(T_world_i)).reshape(self.num, d + 1, d)
-        product = pulls[:, :d] @ T_world_i[:, :d, :d]
+        product = self.pull(V)[:, :d] @ V[:, :d].swapaxes(1, 2)
         return (product + product.swapaxes(1, 2)) / 2
 
     def nearby_minimum(self, T_world_i: np.ndarray) -> np.ndarray:
@@ -117,7 +139,7 @@ class Connection:
     def _searched(
         self, T: np.ndarray, step: np.ndarray, cost: float, decrement: float
     ) -> tuple[np.ndarray | None, float]:
-        """The poses after as much of a step as lowers F, and F; None if nothing does."""
+        """The poses after as much of a step as lowers F, and F; else None."""
         tangent = np.zeros(self.num * self._num_tangents)
         tangent[self._free] = step
         tangent = tangent.reshape(self.num, -1)
@@ -142,11 +164,10 @@ class Connection:
         return kept_unknowns(self.order, k, np.arange(k))
 
     def _slope(self, T: np.ndarray) -> np.ndarray:
-        pulls = (self.matrix @ columns(T)).reshape(self.num, self.dim + 1, self.dim)
-        slope = 2 * np.einsum("vard,vdr->va", _basis(T), pulls)
+        slope = 2 * np.einsum("vard,vdr->va", _basis(T), self.pull(lifted(T)))
         return slope.ravel()[self._free]
 
-    def _curvature(self, T: np.ndarray) -> sla.SuperLU | None:
+    def _curvature(self, T: np.ndarray) -> Factor | None:
         """Factor of the Hessian where F is convex, else without the multipliers."""
         d, k = self.dim, self._num_tangents
         i, j = self.edges.T
@@ -154,7 +175,7 @@ class Connection:
         half = _basis(T).reshape(self.num, k * d, d + 1)
         own, beside = self.blocks
         parts = self._symmetric(_reduced(half[i], beside, half[j], k))
-        for multipliers in (self.multipliers(T), np.zeros((self.num, d, d))):
+        for multipliers in (self.multipliers(lifted(T)), np.zeros((self.num, d, d))):
             less = own.copy()
             less[:, :d, :d] -= multipliers
             whole = [(every, every, _reduced(half, less, half, k)), *parts]
@@ -169,9 +190,9 @@ class Connection:
         return [(i, j, block), (j, i, block.swapaxes(1, 2))]
 
 
-def columns(T_world_i: np.ndarray) -> np.ndarray:
-    """X', `((d+1) v, d)`."""
-    return T_world_i[:, :-1].swapaxes(1, 2).reshape(-1, T_world_i.shape[-1] - 1)
+def lifted(T_world_i: np.ndarray) -> np.ndarray:
+    """The transposed rows of poses, `(v, d+1, d)`, to which columns may be added."""
+    return np.ascontiguousarray(T_world_i[:, :-1].swapaxes(1, 2))
 
 
 def _generators(d: int) -> np.ndarray:
@@ -212,3 +233,17 @@ def nearest_rotations(A: np.ndarray) -> np.ndarray:
     U, _, Vt = np.linalg.svd(A)
     U[..., -1] *= np.linalg.det(U @ Vt)[..., None]
     return U @ Vt
+
+
+def rigid(T: np.ndarray) -> np.ndarray:
+    """Poses in float64 whose rotations are rotations up to its rounding."""
+    exact = np.asarray(T, np.float64).copy()
+    exact[:, :-1, :-1] = nearest_rotations(exact[:, :-1, :-1])
+    return exact
+
+
+def joined(edges: np.ndarray, num: int) -> np.ndarray:
+    """`(v,)` the frames that edges join to frame 0."""
+    links = sp.coo_array((np.ones(len(edges)), tuple(edges.T)), (num, num))
+    label = connected_components(links, directed=False)[1]
+    return label == label[0]
