@@ -14,6 +14,7 @@ from .averaging import AveragingTrace as AveragingTrace
 from .averaging import Certificate as Certificate
 from .averaging import ChordalError as ChordalError
 from .averaging import Correntropy as Correntropy
+from .averaging import EdgeReport as EdgeReport
 from .averaging import LogError as LogError
 from .averaging import LowRankSparse as LowRankSparse
 from .averaging import MotionAveraging as MotionAveraging
@@ -26,6 +27,7 @@ from .averaging import WeightedMotionAveraging as WeightedMotionAveraging
 from .averaging import WeightRows as WeightRows
 from .averaging import average as average
 from .averaging import certify as certify
+from .averaging import edge_report as edge_report
 from .averaging import pose_covariances as pose_covariances
 from .correlation import KernelCorrelation as KernelCorrelation
 from .graph import PoseGraph as PoseGraph

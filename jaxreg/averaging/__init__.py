@@ -8,6 +8,8 @@ from jaxreg.averaging.base import starting_poses as starting_poses
 from jaxreg.averaging.certificate import Certificate as Certificate
 from jaxreg.averaging.certificate import certify as certify
 from jaxreg.averaging.covariance import pose_covariances as pose_covariances
+from jaxreg.averaging.edge_report import EdgeReport as EdgeReport
+from jaxreg.averaging.edge_report import edge_report as edge_report
 from jaxreg.averaging.methods.correntropy import Correntropy as Correntropy
 from jaxreg.averaging.methods.low_rank_sparse import LowRankSparse as LowRankSparse
 from jaxreg.averaging.methods.mcc import MCC as MCC

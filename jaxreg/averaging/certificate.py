@@ -20,6 +20,7 @@ import numpy as np
 from jaxreg._core.checks import as_host_numbers, is_concrete, shown
 from jaxreg._core.status import Status
 from jaxreg.averaging.base import AveragingSolution
+from jaxreg.averaging.covariance import check_solution
 from jaxreg.averaging.relaxation.certificate_matrix import CertificateMatrix
 from jaxreg.averaging.relaxation.connection import (
     Connection,
@@ -27,7 +28,7 @@ from jaxreg.averaging.relaxation.connection import (
     lifted,
     rigid,
 )
-from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses, chordal_weights
+from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
 
 
 # Of the certified gap, what the shift of the eigenvalues may cost.
@@ -226,7 +227,6 @@ def _checked(
     graph: PoseGraph, solution: object, min_trust: float, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which edges are trusted, and the poses."""
-    check_graph(graph, "graph")
     if not isinstance(solution, AveragingSolution):
         raise TypeError(
             f"solution: wanted an AveragingSolution, found {shown(solution)}."
@@ -234,12 +234,7 @@ def _checked(
     leaves = jax.tree.leaves((graph, solution))
     if any(not is_concrete(x) for x in leaves):
         raise TypeError("certify: works on the host, not inside jit, vmap or grad.")
-    check_poses(solution.T_world_i, "solution: T_world_i", graph)
-    if solution.edge_weight.shape != graph.weight.shape:
-        raise ValueError(
-            f"solution: wanted one of {graph.num_edges} edges, found "
-            f"{solution.edge_weight.shape}."
-        )
+    check_solution(graph, solution)
     for name, value in (("min_trust", min_trust), ("tolerance", tolerance)):
         found = as_host_numbers(value, name)
         if found.ndim or not 0 <= found < 1:
