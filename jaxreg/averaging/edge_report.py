@@ -102,7 +102,8 @@ def edge_report(
     with jax.enable_x64(True):
         wide, T = jax.tree.map(_widened, (graph, solution.T_world_i))
         given = np.asarray(solution.edge_weight) > min_trust
-        sound = np.isfinite(np.asarray(wide.T_i_j)).all(axis=(1, 2))
+        finite = np.isfinite(np.asarray(wide.T_i_j)).all(axis=(1, 2))
+        sound: np.ndarray = np.asarray(finite)
         usable = np.asarray(graph.mask) & (np.asarray(graph.weight) > 0) & sound
         trusted = given & usable
         share = jnp.asarray(trusted, jnp.float64)

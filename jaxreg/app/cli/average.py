@@ -195,6 +195,6 @@ def _show_residuals(session: Session, report: EdgeReport, ids: np.ndarray) -> No
     session.console.print(table)
     session.console.print(
         f"Chi-square {report.chi_square:.6g}, {report.degrees_of_freedom} degrees of "
-        f"freedom, variance factor {report.variance_factor:.4g}. Normalised: in standard "
-        "deviations; r: redundancy number."
+        f"freedom, variance factor {report.variance_factor:.4g}. Normalised: in "
+        "standard deviations; r: redundancy number."
     )
