@@ -20,7 +20,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("matching", "features", "averaging.measures"),
     ("registrar", "averaging.likelihood"),
     ("averaging.base",),
-    ("local", "averaging.steps"),
+    ("local", "averaging.steps", "averaging.relaxation"),
     ("correlation", "particle", "averaging.start"),
     ("registration", "averaging.methods"),
     ("averaging",),

@@ -92,6 +92,9 @@ AVERAGERS = {
     "PoseGraphLM": Row(
         lambda d: jr.PoseGraphLM(tolerance=1e-15), {**_EXACT, "lengths": True}
     ),
+    "RiemannianStaircase": Row(
+        lambda d: jr.RiemannianStaircase(tolerance=1e-15), {**_EXACT, "lengths": True}
+    ),
     "PoseGraphLM by optimistix": Row(
         lambda d: jr.PoseGraphLM(
             tolerance=1e-9, solver=optimistix.LevenbergMarquardt(1e-12, 1e-12)
@@ -168,6 +171,8 @@ FUNCTIONS = {
     "reconstruct",
     "correspondences",
     "pose_covariances",
+    "certify",
+    "edge_report",
     "sandhu2010",
 }
 

@@ -17,6 +17,7 @@ from jaxreg.averaging import (
     Correntropy,
     MotionAveraging,
     PoseGraphLM,
+    RiemannianStaircase,
     average,
 )
 from jaxreg.graph import PoseGraph
@@ -37,6 +38,7 @@ OPTIMA = {
 METHODS: dict[str, AbstractAverager] = {
     "jaxreg PoseGraphLM": PoseGraphLM(),
     "jaxreg PoseGraphLM, chordal": PoseGraphLM(ChordalError()),
+    "jaxreg RiemannianStaircase": RiemannianStaircase(),
     "jaxreg MotionAveraging": MotionAveraging(),
     "jaxreg default": Correntropy(),
 }

@@ -31,6 +31,7 @@ or start nearer to the solution.
     DIVERGED = 8
     UNIT_DIFFERS = 9
     NO_AGREEMENT = 10
+    UNCERTIFIED = 11
 
     def __str__(self) -> str:
         return self.name
@@ -88,6 +89,10 @@ _ADVICE = {
         "No motions agree with each other beyond what any tree of them agrees with by "
         "itself, so the poses are a guess. Register again with more overlap, or add "
         "edges."
+    ),
+    Status.UNCERTIFIED: (
+        "The poses are not proved to be the best: they are a local minimum or none, or "
+        "the noise is too large for a proof. Average by `RiemannianStaircase()`."
     ),
     Status.DISCONNECTED: (
         "The trusted edges do not reach every pose. See `placed`, and `component` "

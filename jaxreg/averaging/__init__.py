@@ -5,7 +5,11 @@ from jaxreg.averaging.base import AbstractAverager as AbstractAverager
 from jaxreg.averaging.base import AveragingSolution as AveragingSolution
 from jaxreg.averaging.base import solution as solution
 from jaxreg.averaging.base import starting_poses as starting_poses
+from jaxreg.averaging.certificate import Certificate as Certificate
+from jaxreg.averaging.certificate import certify as certify
 from jaxreg.averaging.covariance import pose_covariances as pose_covariances
+from jaxreg.averaging.edge_report import EdgeReport as EdgeReport
+from jaxreg.averaging.edge_report import edge_report as edge_report
 from jaxreg.averaging.methods.correntropy import Correntropy as Correntropy
 from jaxreg.averaging.methods.low_rank_sparse import LowRankSparse as LowRankSparse
 from jaxreg.averaging.methods.mcc import MCC as MCC
@@ -14,6 +18,9 @@ from jaxreg.averaging.methods.motion_averaging import (
     WeightedMotionAveraging as WeightedMotionAveraging,
 )
 from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM as PoseGraphLM
+from jaxreg.averaging.methods.riemannian_staircase import (
+    RiemannianStaircase as RiemannianStaircase,
+)
 from jaxreg.averaging.methods.shortest_paths import ShortestPaths as ShortestPaths
 from jaxreg.averaging.methods.spanning_tree import SpanningTree as SpanningTree
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus as CycleConsensus

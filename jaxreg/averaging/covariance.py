@@ -39,6 +39,19 @@ def pose_covariances(
 
     Gradients: none (cut).
     """
+    check_solution(graph, solution)
+    check_count(max_unknowns, "max_unknowns")
+    k = lie.tangent_dim(graph.dim)
+    if graph.num_poses * k > max_unknowns:
+        raise ValueError(
+            f"graph: wanted at most {max_unknowns // k} poses for covariances, "
+            f"found {graph.num_poses}."
+        )
+    return _covariances(graph, solution)
+
+
+def check_solution(graph: PoseGraph, solution: AveragingSolution) -> None:
+    """Requires a graph and a solution of it."""
     check_graph(graph, "graph")
     if not isinstance(solution, AveragingSolution):
         raise TypeError(
@@ -50,14 +63,6 @@ def pose_covariances(
             f"solution: wanted one of {graph.num_edges} edges, found "
             f"{solution.edge_weight.shape}."
         )
-    check_count(max_unknowns, "max_unknowns")
-    k = lie.tangent_dim(graph.dim)
-    if graph.num_poses * k > max_unknowns:
-        raise ValueError(
-            f"graph: wanted at most {max_unknowns // k} poses for covariances, "
-            f"found {graph.num_poses}."
-        )
-    return _covariances(graph, solution)
 
 
 @eqx.filter_jit
@@ -69,7 +74,7 @@ def _covariances(
     usable = jnp.all(jnp.isfinite(graph.T_i_j), axis=(1, 2)) & graph.mask
     trust = jnp.where(usable, solution.edge_weight, 0)
     T = solution.T_world_i
-    deviation = _deviations(graph, T, trust)
+    deviation = deviations(graph, T, trust)
     W = precisions(graph, trust, deviation)
     if graph.information is None:
         W = W / deviation[1] ** 2
@@ -88,7 +93,7 @@ def _covariances(
     return blocks.at[0].set(0)
 
 
-def _deviations(graph: PoseGraph, T: Array, trust: Array) -> Float[Array, "2"]:
+def deviations(graph: PoseGraph, T: Array, trust: Array) -> Float[Array, "2"]:
     """Of one component of a translation and of a rotation, by the trusted edges."""
     d, k = graph.dim, lie.tangent_dim(graph.dim)
     rotation, translation = graph.differences(T)

@@ -20,10 +20,12 @@ from jaxreg.app.versions import versions
 from jaxreg.averaging import (
     AveragingSolution,
     Correntropy,
+    EdgeReport,
     MotionAveraging,
     ShortestPaths,
     WeightedMotionAveraging,
     average,
+    edge_report,
 )
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.errors import InputError
@@ -61,8 +63,10 @@ def run(command: Average, session: Session) -> int:
         jax.block_until_ready(sol)
         progress("averaging", 2, 2)
     objective = [float(chordal_objective(graph, s.T_world_i)) for s in (before, sol)]
-    _write(session, graph, before, sol, ids, objective)
+    report = edge_report(graph, sol)
+    _write(session, graph, before, sol, ids, objective, report)
     _show(session, graph, sol, objective)
+    _show_residuals(session, report, ids)
     outputs.show_end(session, FILES, command.out)
     return 0
 
@@ -83,6 +87,7 @@ def _write(
     sol: AveragingSolution,
     ids: np.ndarray,
     objective: list[float],
+    report: EdgeReport,
 ) -> None:
     with result_folder(session.options.out) as staging:
         with session.timed("write"):
@@ -102,13 +107,27 @@ def _write(
             )
         document = _document(sol, ids, objective)
         document["edges"] = [
-            {"i": int(ids[i]), "j": int(ids[j]), "weight": float(w)}
-            for (i, j), w in zip(
-                np.asarray(graph.edges).tolist(),
-                np.asarray(sol.edge_weight),
-                strict=True,
+            {
+                "i": int(ids[i]),
+                "j": int(ids[j]),
+                "weight": float(w),
+                "normalised_residual": float(report.normalised[row]),
+                "redundancy": float(report.redundancy[row]),
+            }
+            for row, ((i, j), w) in enumerate(
+                zip(
+                    np.asarray(graph.edges).tolist(),
+                    np.asarray(sol.edge_weight),
+                    strict=True,
+                )
             )
         ]
+        document["adjustment"] = {
+            "chi_square": report.chi_square,
+            "degrees_of_freedom": report.degrees_of_freedom,
+            "variance_factor": report.variance_factor,
+            "p_value": report.p_value if report.prior_noise else None,
+        }
         document |= {
             "command": session.command,
             "seed": session.options.seed,
@@ -169,4 +188,25 @@ def _show(
     session.console.print(
         "Objective: sum of kappa |R_j - R_i R_i_j|^2 + tau |t_j - t_i - R_i t_i_j|^2 "
         "(SE-Sync)."
+    )
+
+
+def _show_residuals(session: Session, report: EdgeReport, ids: np.ndarray) -> None:
+    """The adjustment as surveyors read it."""
+    table = Table(title="Largest residuals")
+    for name in ("from", "to", "translation", "rotation (deg)", "normalised", "r"):
+        table.add_column(name, justify="right")
+    for row in report.worst:
+        i, j = report.edges[row]
+        table.add_row(
+            *(str(ids[i]), str(ids[j]), f"{report.translation[row]:.4g}"),
+            f"{np.rad2deg(report.rotation[row]):.4g}",
+            f"{report.normalised[row]:.2f}",
+            f"{report.redundancy[row]:.2f}",
+        )
+    session.console.print(table)
+    session.console.print(
+        f"Chi-square {report.chi_square:.6g}, {report.degrees_of_freedom} degrees of "
+        f"freedom, variance factor {report.variance_factor:.4g}. Normalised: in "
+        "standard deviations; r: redundancy number."
     )

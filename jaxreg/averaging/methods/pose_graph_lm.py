@@ -6,7 +6,7 @@ The steps are those of `jaxreg.averaging.steps.levenberg_marquardt`.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import (
@@ -124,16 +124,28 @@ class PoseGraphLM(AbstractAverager):
         T_start = jax.lax.stop_gradient(
             starting_poses(self.initialiser, fixed, init, key)
         )
-        problem = held._problem(fixed)
+        problem = held.problem(fixed)
         end, trace = held._minimum(problem, T_start)
-        T = self._with_gradients(graph, problem, end.T)
-        problem = self._problem(graph)
+        return self.solution_at(graph, end.T, end.converged, end.step, trace)
+
+    def solution_at(
+        self,
+        graph: PoseGraph,
+        T: Float[Array, "v D D"],
+        converged: Bool[Array, ""],
+        num_steps: Int[Array, ""],
+        trace: AveragingTrace | None,
+    ) -> AveragingSolution:
+        """The solution where a minimum of the objective was found, with gradients."""
+        fixed, held = jax.lax.stop_gradient((graph, self))
+        T = self._with_gradients(graph, held.problem(fixed), T)
+        problem = self.problem(graph)
         return solution(
             graph,
             T,
             edge_weight=problem.trust(problem.squares(T)),
-            converged=end.converged,
-            num_steps=end.step,
+            converged=converged,
+            num_steps=num_steps,
             trace=trace,
         )
 
@@ -159,10 +171,11 @@ class PoseGraphLM(AbstractAverager):
         return differentiable(graph, T, self._imbalance, weight, precondition)
 
     def _imbalance(self, graph: PoseGraph, T: Array) -> Array:
-        force = self._problem(graph).normal(T)[1]
+        force = self.problem(graph).normal(T)[1]
         return -divergence(graph.edges, force, graph.num_poses)
 
-    def _problem(self, graph: PoseGraph) -> Problem:
+    def problem(self, graph: PoseGraph) -> Problem:
+        """What is minimised."""
         error, precision = self.error, self.error.precision(graph)
         if self.kernel is None:
             return Problem(graph, error, precision, jnp.asarray, jnp.ones_like)

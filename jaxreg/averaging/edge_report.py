@@ -1,0 +1,160 @@
+"""`edge_report`: what an adjustment says of each motion, in the terms of surveyors."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import chi2
+
+from jaxreg._core.checks import check_count
+from jaxreg.averaging.base import AveragingSolution
+from jaxreg.averaging.covariance import check_solution, deviations
+from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
+from jaxreg.geometry import lie
+from jaxreg.graph.pose_graph import PoseGraph, product
+
+
+@dataclass(frozen=True, repr=False)
+class EdgeReport:
+    """Residuals of an adjustment. NumPy arrays, float64.
+
+    Attributes:
+        edges: `(e, 2)` frames i and j.
+        trusted: `(e,)` whether an edge is part of the adjustment.
+        rotation: `(e,)` size of the residual, radians.
+        translation: `(e,)` size of the residual, unit of the graph.
+        normalised: `(e,)` root mean square of the residual's k components in a-priori
+            standard deviations, sqrt(r' Omega r / k); also of edges not trusted.
+        redundancy: `(e,)` the redundancy number, mean over the k components: the share
+            of an error in the motion that shows in its residual. 0 where nothing checks
+            an edge, near 1 where others fix both its frames. 1 for edges not trusted;
+            NaN where the graph is too large. All times k sum to `degrees_of_freedom`.
+        chi_square: sum of r' Omega r over the trusted edges.
+        degrees_of_freedom: components of trusted motions less those of free poses.
+        variance_factor: chi_square over degrees_of_freedom, the a-posteriori variance
+            of unit weight: 1 where the information is that of the noise; NaN without
+            redundancy.
+        p_value: probability of so large a chi_square if it is.
+        prior_noise: whether the graph has information; without, standard deviations
+            are those that the residuals show, and chi_square tests nothing.
+        worst: rows of the ten trusted edges of largest `normalised`, largest first.
+    """
+
+    edges: np.ndarray
+    trusted: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+    normalised: np.ndarray
+    redundancy: np.ndarray
+    chi_square: float
+    degrees_of_freedom: int
+    variance_factor: float
+    p_value: float
+    prior_noise: bool
+    worst: np.ndarray
+
+    def __repr__(self) -> str:
+        return (
+            f"EdgeReport({int(self.trusted.sum())} of {len(self.edges)} edges, "
+            f"chi-square {self.chi_square:.6g} of {self.degrees_of_freedom} degrees of "
+            f"freedom,\n    variance factor {self.variance_factor:.4g})"
+        )
+
+
+def edge_report(
+    graph: PoseGraph,
+    solution: AveragingSolution,
+    *,
+    min_trust: float = 0.5,
+    max_unknowns: int = 6000,
+) -> EdgeReport:
+    """Residuals, chi-square and redundancy numbers of averaged poses.
+
+        >>> import jaxreg as jr
+        >>> east = [[1, 0, 1], [0, 1, 0], [0, 0, 1]]
+        >>> far = [[1, 0, 2.3], [0, 1, 0], [0, 0, 1]]
+        >>> graph = jr.PoseGraph.from_edges([(0, 1), (1, 2), (0, 2)], [east, east, far])
+        >>> jr.edge_report(graph, jr.average(graph, jr.MotionAveraging()))
+        EdgeReport(3 of 3 edges, chi-square 3 of 3 degrees of freedom,
+            variance factor 1)
+
+    Residuals are log(inv(T_i_j) inv(T_world_i) T_world_j), that of g2o and GTSAM; Omega
+    is prior weight times information. Runs on the host.
+
+    Args:
+        graph: that was averaged.
+        solution: its solution, by any method.
+        min_trust: edges whose `edge_weight` is above it are trusted.
+        max_unknowns: k per frame, at most, for redundancy numbers, which come from a
+            dense inverse in float64.
+
+    Raises:
+        TypeError: for anything but a graph and a solution.
+        ValueError: for a solution of another graph.
+
+    Gradients: none.
+
+    Reference: Baarda 1968; Foerstner 1987 (redundancy numbers).
+    """
+    check_solution(graph, solution)
+    check_count(max_unknowns, "max_unknowns")
+    with jax.enable_x64(True):
+        wide, T = jax.tree.map(_widened, (graph, solution.T_world_i))
+        given = np.asarray(solution.edge_weight) > min_trust
+        finite = np.isfinite(np.asarray(wide.T_i_j)).all(axis=(1, 2))
+        sound: np.ndarray = np.asarray(finite)
+        usable = np.asarray(graph.mask) & (np.asarray(graph.weight) > 0) & sound
+        trusted = given & usable
+        share = jnp.asarray(trusted, jnp.float64)
+        noise = deviations(wide, T, share)
+        Omega = precisions(wide, jnp.ones_like(share), noise)
+        if wide.information is None:
+            Omega = Omega / noise[1] ** 2
+        r = np.where(sound[:, None], np.asarray(wide.tangent_errors(T)), np.nan)
+        weights = np.asarray(Omega)
+        k = r.shape[1]
+        redundancy = np.full(len(r), np.nan)
+        if graph.num_poses * k <= max_unknowns:
+            W = jnp.where(trusted[:, None, None], Omega, 0)
+            redundancy = np.where(trusted, _redundancy(wide, T, W) / k, 1.0)
+    square = np.einsum("ea,eab,eb->e", r, weights, r)
+    held = np.unique(np.append(np.asarray(graph.edges)[trusted], 0))
+    spare = k * (int(trusted.sum()) - (len(held) - 1))
+    total = float(square[trusted].sum())
+    normalised = np.sqrt(square / k)
+    order = np.argsort(-np.where(trusted, normalised, -1), kind="stable")
+    d = graph.dim
+    return EdgeReport(
+        edges=np.asarray(graph.edges),
+        trusted=trusted,
+        rotation=np.linalg.norm(r[:, d:], axis=1),
+        translation=np.linalg.norm(r[:, :d], axis=1),
+        normalised=normalised,
+        redundancy=redundancy,
+        chi_square=total,
+        degrees_of_freedom=spare,
+        variance_factor=total / spare if spare > 0 else float("nan"),
+        p_value=float(chi2.sf(total, spare)) if spare > 0 else float("nan"),
+        prior_noise=graph.information is not None,
+        worst=order[: min(10, int(trusted.sum()))],
+    )
+
+
+def _redundancy(graph: PoseGraph, T: jax.Array, W: jax.Array) -> np.ndarray:
+    """`(e,)` k less the trace of W A inv(A' W A) A' for each edge's rows A."""
+    num, k = graph.num_poses, W.shape[-1]
+    H = np.asarray(normal_equations(graph, T, W)[0])
+    C = np.linalg.inv(H).reshape(num, k, num, k).swapaxes(1, 2)
+    C[0], C[:, 0] = 0, 0
+    i, j = np.asarray(graph.edges).T
+    J = -np.asarray(lie.adjoint(product(lie.inverse(T)[j], T[i])))
+    Jt = J.swapaxes(1, 2)
+    cross = J @ C[i, j]
+    covariance = J @ C[i, i] @ Jt + cross + cross.swapaxes(1, 2) + C[j, j]
+    return k - np.einsum("eab,eba->e", np.asarray(W), covariance)
+
+
+def _widened(x: jax.Array) -> jax.Array:
+    floating = jnp.issubdtype(x.dtype, jnp.floating)
+    return jnp.asarray(np.asarray(x), jnp.float64) if floating else x

@@ -1,0 +1,1 @@
+"""The semidefinite relaxation of averaging, on the host: certificate and staircase."""
