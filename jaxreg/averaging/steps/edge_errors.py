@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.brief import BriefModule
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
+from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
+from jaxreg.linear.small import product
 
 
 class AbstractEdgeError(BriefModule):
