@@ -47,6 +47,16 @@ def cast_floats(tree: Tree, dtype: Any) -> Tree:
     return jax.tree.map(cast, tree)
 
 
+def widened(tree: Tree) -> Tree:
+    """The numbers of concrete arrays in float64, which must be switched on."""
+
+    def wide(x: Array) -> Array:
+        floating = jnp.issubdtype(x.dtype, jnp.floating)
+        return jnp.asarray(np.asarray(x), jnp.float64) if floating else x
+
+    return jax.tree.map(wide, tree)
+
+
 def on_both(function: Callable[[Tree], Out], a: Tree, b: Tree) -> tuple[Out, Out]:
     """`function` of either tree; of arrays of the same shapes it is compiled once."""
     first, second = (jax.tree.map(jax.typeof, tree) for tree in (a, b))

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxreg._core.arrays import widened
 from jaxreg._core.checks import as_host_numbers, is_concrete, shown
 from jaxreg._core.status import Status
 from jaxreg.averaging.base import AveragingSolution
@@ -128,7 +129,7 @@ def certify(
     """
     trusted, T = _checked(graph, solution, min_trust, tolerance)
     with jax.enable_x64(True):
-        wide = jax.tree.map(_widened, graph)
+        wide = widened(graph)
         kappa, tau = (np.asarray(x) for x in _weights(wide))
     usable = trusted & np.asarray(graph.mask) & (kappa > 0) & (tau > 0)
     motions = np.asarray(graph.T_i_j, np.float64)
@@ -216,11 +217,6 @@ def _concluded(
 
 
 _weights = jax.jit(chordal_weights)
-
-
-def _widened(x: jax.Array) -> jax.Array:
-    floating = jnp.issubdtype(x.dtype, jnp.floating)
-    return jnp.asarray(np.asarray(x), jnp.float64) if floating else x
 
 
 def _checked(

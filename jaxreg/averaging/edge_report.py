@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2
 
+from jaxreg._core.arrays import widened
 from jaxreg._core.checks import check_count
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.covariance import check_solution, deviations
@@ -100,7 +101,7 @@ def edge_report(
     check_solution(graph, solution)
     check_count(max_unknowns, "max_unknowns")
     with jax.enable_x64(True):
-        wide, T = jax.tree.map(_widened, (graph, solution.T_world_i))
+        wide, T = widened((graph, solution.T_world_i))
         given = np.asarray(solution.edge_weight) > min_trust
         finite = np.isfinite(np.asarray(wide.T_i_j)).all(axis=(1, 2))
         sound: np.ndarray = np.asarray(finite)
@@ -153,8 +154,3 @@ def _redundancy(graph: PoseGraph, T: jax.Array, W: jax.Array) -> np.ndarray:
     cross = J @ C[i, j]
     covariance = J @ C[i, i] @ Jt + cross + cross.swapaxes(1, 2) + C[j, j]
     return k - np.einsum("eab,eba->e", np.asarray(W), covariance)
-
-
-def _widened(x: jax.Array) -> jax.Array:
-    floating = jnp.issubdtype(x.dtype, jnp.floating)
-    return jnp.asarray(np.asarray(x), jnp.float64) if floating else x

@@ -189,7 +189,7 @@ def test_recall_is_that_of_the_benchmark(
 
 
 @pytest.mark.data
-def test_recall_of_the_kitchen_is_the_published_one(
+def test_recall_of_the_kitchen_by_the_counts_of_3dmatch(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ):
     kitchen = data_dir("redwood_3dmatch_relative_poses", "7-scenes-redkitchen")
