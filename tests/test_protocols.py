@@ -53,7 +53,7 @@ from jaxreg.testing.promises import (
 #: Whose whole check is left to `-m slow`: each shares its parts with one that is not.
 SLOW = {
     *("MultiStart", "sandhu2010", "KernelCorrelation by optimistix"),
-    "PoseGraphLM by optimistix",
+    *("PoseGraphLM by optimistix", "RiemannianStaircase"),
     *("CycleConsensus", "MCC", "WeightedMotionAveraging", "LowRankSparse"),
     *("BoxTree", "CellGrid"),
 }

@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import MotionAveraging, average, pose_covariances
-from jaxreg.averaging.covariance import _deviations
+from jaxreg.averaging.covariance import deviations
 from jaxreg.averaging.measures import length_scale
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import motions, random_graph, rotations
@@ -142,7 +142,7 @@ def test_deviations_are_those_of_the_noise_of_one_component(d):
     edges = np.tile([0, 1], (3000, 1))
     graph = PoseGraph.from_edges(edges, noise.astype(np.float32))
     poses = jnp.broadcast_to(jnp.eye(d + 1), (2, d + 1, d + 1))
-    found = _deviations(graph, poses, jnp.ones(3000))
+    found = deviations(graph, poses, jnp.ones(3000))
     np.testing.assert_allclose(found, [0.05, 0.01], rtol=0.05)
 
 

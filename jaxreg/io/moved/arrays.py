@@ -2,8 +2,9 @@
 
 import zipfile
 from collections.abc import Iterator, Mapping
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO
+from typing import cast
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from jaxreg.io.points.arrays import parse_npz
 _ROWS = 1_000_000
 
 
-def move_npy(path: Path, out: IO[bytes], moving: Moving) -> None:
+def move_npy(path: Path, out: BufferedIOBase, moving: Moving) -> None:
     """Writes the array again, float32 where that holds its digits."""
     found = np.load(path, mmap_mode="r", allow_pickle=False)
     parts = (found[k : k + _ROWS] for k in range(0, len(found), _ROWS))
@@ -22,7 +23,7 @@ def move_npy(path: Path, out: IO[bytes], moving: Moving) -> None:
     _write(out, found, moving, np.float64 if wide else np.float32)
 
 
-def move_npz(path: Path, out: IO[bytes], motions: Mapping[str, Moving]) -> None:
+def move_npz(path: Path, out: BufferedIOBase, motions: Mapping[str, Moving]) -> None:
     """Writes the arrays that have a motion again, one after another."""
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for key, (found, _, _) in parse_npz(path).items():
@@ -30,11 +31,12 @@ def move_npz(path: Path, out: IO[bytes], motions: Mapping[str, Moving]) -> None:
                 continue
             wide = found.dtype == np.float64 or motions[key].goes_far([found])
             with archive.open(f"{key}.npy", "w", force_zip64=True) as file:
-                _write(file, found, motions[key], np.float64 if wide else np.float32)
+                kind = np.float64 if wide else np.float32
+                _write(cast(BufferedIOBase, file), found, motions[key], kind)
 
 
 def _write(
-    out: IO[bytes], found: np.ndarray, moving: Moving, kind: type[np.floating]
+    out: BufferedIOBase, found: np.ndarray, moving: Moving, kind: type[np.floating]
 ) -> None:
     head = {"descr": np.dtype(kind).str, "fortran_order": False, "shape": found.shape}
     np.lib.format.write_array_header_1_0(out, head)

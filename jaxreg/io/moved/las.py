@@ -2,8 +2,8 @@
 
 import copy
 import itertools
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
@@ -16,7 +16,7 @@ _CHUNK = 500_000
 _MOST = 2_000_000_000  # steps of a scale that an int32 holds
 
 
-def move_las(path: Path, out: IO[bytes], moving: Moving) -> None:
+def move_las(path: Path, out: BufferedIOBase, moving: Moving) -> None:
     """Writes the file again by chunks, packed if it was; scales as they were."""
     laspy = require("laspy", "Writing LAS and LAZ")
     require("lazrs", "Writing LAZ")

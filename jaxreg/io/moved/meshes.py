@@ -1,8 +1,8 @@
 """OBJ and STL: vertices and normals, the rest to the letter."""
 
 from collections.abc import Iterator
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
@@ -17,12 +17,12 @@ _FACET = np.dtype(
 )
 
 
-def move_obj(path: Path, out: IO[bytes], moving: Moving) -> None:
+def move_obj(path: Path, out: BufferedIOBase, moving: Moving) -> None:
     """Writes lines again; those of vertices (`v`) and normals (`vn`) are moved."""
     _move_lines(path, out, moving, {"v": 1}, {"vn": 1})
 
 
-def move_stl(path: Path, out: IO[bytes], moving: Moving) -> None:
+def move_stl(path: Path, out: BufferedIOBase, moving: Moving) -> None:
     """Writes triangles again, binary or text; coordinates stay float32."""
     with path.open("rb") as file:
         head = file.read(84)
@@ -42,7 +42,7 @@ def move_stl(path: Path, out: IO[bytes], moving: Moving) -> None:
 
 def _move_lines(
     path: Path,
-    out: IO[bytes],
+    out: BufferedIOBase,
     moving: Moving,
     points: dict[str, int],
     normals: dict[str, int],
@@ -61,7 +61,7 @@ def _move_lines(
 
 
 def _words(
-    file: IO[bytes], starts: dict[str, int]
+    file: BufferedIOBase, starts: dict[str, int]
 ) -> Iterator[tuple[list[str], int, bytes]]:
     for line in file:
         words = line.decode("latin1").split()

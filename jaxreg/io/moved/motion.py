@@ -42,4 +42,4 @@ class Moving(NamedTuple):
             x = x[np.isfinite(x).all(axis=1)].astype(np.float64)
             before = max(before, np.abs(x).max(initial=0))
             after = max(after, np.abs(self.points(x)).max(initial=0))
-        return after > _MUCH_FARTHER * before * max(1.0, self.scale)
+        return bool(after > _MUCH_FARTHER * before * max(1.0, self.scale))

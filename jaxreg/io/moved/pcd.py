@@ -2,8 +2,9 @@
 
 import io
 from collections.abc import Iterator
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from jaxreg.io.points.pcd import header_lines
 from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
 
 
-def move_pcd(path: Path, out: IO[bytes], moving: Moving) -> None:
+def move_pcd(path: Path, out: BufferedIOBase, moving: Moving) -> None:
     """Writes the file again, its viewpoint moved, too; compressed ones as binary."""
     pypcd4 = require("pypcd4", "Writing PCD")
     with path.open("rb") as file:

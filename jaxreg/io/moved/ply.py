@@ -7,8 +7,8 @@ import itertools
 import re
 import shutil
 from collections.abc import Iterator
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from jaxreg.io.points.ply import coordinates
 from jaxreg.io.points.ply_layout import Element, Header, end_of, read_header
 
 
-def move_ply(path: Path, out: IO[bytes], moving: Moving) -> None:
+def move_ply(path: Path, out: BufferedIOBase, moving: Moving) -> None:
     """Writes the file again; coordinates become double where float has few digits."""
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -95,8 +95,8 @@ def _retyped(head: bytes, names: list[str], wide: bool) -> bytes:
 
 
 def _move_text(
-    file: IO[bytes],
-    out: IO[bytes],
+    file: BufferedIOBase,
+    out: BufferedIOBase,
     header: Header,
     moving: Moving,
     names: tuple[list[str], tuple[str, ...] | None],
@@ -120,7 +120,7 @@ def _move_text(
         out.write((" ".join(row) + "\n").encode("latin1"))
 
 
-def _copy(file: IO[bytes], out: IO[bytes], num: int) -> None:
+def _copy(file: BufferedIOBase, out: BufferedIOBase, num: int) -> None:
     while num:
         data = file.read(min(num, 1 << 24))
         if not data:

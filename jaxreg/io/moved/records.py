@@ -1,7 +1,8 @@
 """Binary records of a file, read by blocks, moved, and written to another."""
 
 from collections.abc import Iterator, Sequence
-from typing import IO, Any
+from io import BufferedIOBase
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from jaxreg.io.moved.motion import Moving
 _BYTES = 1 << 25  # that are in memory at a time
 
 
-def blocks(file: IO[bytes], num: int, dtype: np.dtype) -> Iterator[np.ndarray]:
+def blocks(file: BufferedIOBase, num: int, dtype: np.dtype) -> Iterator[np.ndarray]:
     """The next records of a file.
 
     Raises:

@@ -2,8 +2,8 @@
 
 import itertools
 from collections.abc import Iterable, Iterator
+from io import BufferedIOBase
 from pathlib import Path
-from typing import IO
 
 from jaxreg.io.files import text_lines
 from jaxreg.io.moved import lines
@@ -13,7 +13,7 @@ from jaxreg.io.points.dialect import Dialect, is_comment
 from jaxreg.io.points.text import Layout, rows_from
 
 
-def move_text(path: Path, out: IO[bytes], moving: Moving) -> None:
+def move_text(path: Path, out: BufferedIOBase, moving: Moving) -> None:
     """Writes rows again with as many decimals, comments and heads as they were.
 
     Cells are separated as before; blanks around them and quotes are not kept.
