@@ -44,8 +44,7 @@ from jaxreg._core import control
 from jaxreg.averaging.measures import length_scale, nearest_rank, num_held
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
-from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.linear.small import product
+from jaxreg.graph.pose_graph import PoseGraph, product
 
 
 #: Deviations of right edges, radians and length scales: octaves from where the normal

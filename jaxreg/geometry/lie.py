@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Key, Motions
 from jaxreg.geometry.nearest_rotation import nearest_rotation
-from jaxreg.linear.small import product
 
 
 P = ParamSpec("P")
@@ -94,6 +93,10 @@ def log_jacobian(tangent: Float[Array, "*b k"]) -> Float[Array, "*b k k"]:
         shift = jnp.stack([tangent[..., 1], -tangent[..., 0]], axis=-1)[..., None]
     else:
         shift = _hat(tangent[..., :d])
+    low = jnp.zeros((*tangent.shape[:-1], k - d, d), tangent.dtype)
+    corner = turn if d == 3 else jnp.zeros_like(low[..., :1])
+    top = jnp.concatenate([turn, shift], axis=-1)
+    ad = jnp.concatenate([top, jnp.concatenate([low, corner], axis=-1)], axis=-2)
     sq = jnp.sum(tangent[..., d:] ** 2, axis=-1)[..., None, None]
     wide = sq > _SMALL**2
     safe = jnp.where(wide, sq, 1)
@@ -102,25 +105,9 @@ def log_jacobian(tangent: Float[Array, "*b k"]) -> Float[Array, "*b k k"]:
     slope = h / 2 - (half / jnp.sin(half)) ** 2 / 2
     a = jnp.where(wide, (slope - 2 * (h - 1)) / safe, 1 / 12 - sq**2 / 30240)
     b = jnp.where(wide, (slope - h + 1) / safe**2, -1 / 720 - sq / 15120)
-    # ad = [turn, shift; 0, low], block by block.
-    low = turn if d == 3 else jnp.zeros_like(shift[..., :1, :])
-    turn2, low2 = product(turn, turn), product(low, low)
-    shift2 = product(turn, shift) + product(shift, low)
-    shift4 = product(turn2, shift2) + product(shift2, low2)
-
-    def series(ad: Array, ad2: Array, ad4: Array) -> Array:
-        return ad / 2 + a * ad2 + b * ad4
-
-    first = jnp.eye(d, dtype=turn.dtype) + series(turn, turn2, product(turn2, turn2))
-    last = jnp.eye(k - d, dtype=turn.dtype) + series(low, low2, product(low2, low2))
-    return _upper(first, series(shift, shift2, shift4), last)
-
-
-def _upper(first: Array, corner: Array, last: Array) -> Array:
-    """[first, corner; 0, last]."""
-    zero = jnp.zeros_like(jnp.swapaxes(corner, -1, -2))
-    top = jnp.concatenate([first, corner], axis=-1)
-    return jnp.concatenate([top, jnp.concatenate([zero, last], axis=-1)], axis=-2)
+    ad2 = jnp.einsum("...ab,...bc->...ac", ad, ad)
+    ad4 = jnp.einsum("...ab,...bc->...ac", ad2, ad2)
+    return jnp.eye(k, dtype=ad.dtype) + ad / 2 + a * ad2 + b * ad4
 
 
 def _hat(w: Float[Array, "*b r"]) -> Float[Array, "*b d d"]:
@@ -163,9 +150,12 @@ def adjoint(T: Motions) -> Float[Array, "*b k k"]:
         shift = jnp.stack([t[..., 1], -t[..., 0]], axis=-1)[..., None]
         turn = jnp.ones_like(shift[..., :1, :])
     else:
-        shift = product(_hat(t), R)
+        # A product of matrices may be run in reduced precision on accelerators.
+        shift = jnp.sum(_hat(t)[..., None] * R[..., None, :, :], axis=-2)
         turn = R
-    return _upper(R, shift, turn)
+    low = jnp.zeros((*turn.shape[:-1], R.shape[-1]), T.dtype)
+    top = jnp.concatenate([R, shift], axis=-1)
+    return jnp.concatenate([top, jnp.concatenate([low, turn], axis=-1)], axis=-2)
 
 
 def compose(
@@ -194,7 +184,7 @@ def translation(T: Motions) -> Float[Array, "*b d"]:
 def inverse(T: Motions) -> Motions:
     """The inverse motion, by transposition."""
     R_inv = jnp.swapaxes(rotation(T), -1, -2)
-    return compose(R_inv, -product(R_inv, translation(T)[..., None])[..., 0])
+    return compose(R_inv, -jnp.sum(R_inv * translation(T)[..., None, :], axis=-1))
 
 
 def act(T: Float[Array, "D D"], points: Float[Array, "*n d"]) -> Float[Array, "*n d"]:

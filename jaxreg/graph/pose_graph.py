@@ -26,7 +26,14 @@ from jaxreg.graph.edge_checks import (
     check_weights,
     count_poses,
 )
-from jaxreg.linear.small import inverse, product
+from jaxreg.linear.small import inverse
+
+
+def product(
+    A: Float[Array, "*#b p q"], B: Float[Array, "*#b q r"]
+) -> Float[Array, "*b p r"]:
+    """A @ B for many small matrices: a broadcast sum is several times faster on CPU."""
+    return jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2)
 
 
 class PoseGraph(eqx.Module):

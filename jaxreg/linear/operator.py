@@ -12,8 +12,6 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float, Int
 
-from jaxreg.linear.small import product
-
 
 class GraphLaplacian(lx.AbstractLinearOperator):
     """sum_e (x_j - x_i)' W_e (x_j - x_i) + sum_i x_i' own_i x_i, as a matrix.
@@ -90,8 +88,8 @@ class GraphLaplacian(lx.AbstractLinearOperator):
 
 
 def matmul(A: Float[Array, "v a b"], x: Float[Array, "v b c"]) -> Float[Array, "v a c"]:
-    """A @ x; of one column `einsum` is quicker on a CPU."""
-    return product(A, x) if x.shape[-1] > 1 else jnp.einsum("vab,vbc->vac", A, x)
+    """A @ x, quicker on CPU than `@` or a broadcast sum for blocks of six."""
+    return jnp.einsum("vab,vbc->vac", A, x)
 
 
 def divergence(

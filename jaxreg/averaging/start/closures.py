@@ -10,9 +10,8 @@ from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.start.cycles import NEUTRAL
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, product
 from jaxreg.graph.trees import along_frames
-from jaxreg.linear.small import product
 
 
 # Closures next to each other have ends less than so many frames apart, and are less

@@ -11,10 +11,9 @@ from jaxreg.averaging.start.cycles import ROUNDS
 from jaxreg.averaging.steps.iterate import nearby_rotation
 from jaxreg.averaging.steps.kernel_width import KERNEL_DEVIATIONS, gaussian_trust
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, product
 from jaxreg.linear.laplacian import laplacian
 from jaxreg.linear.operator import divergence
-from jaxreg.linear.small import product
 
 
 def settled(

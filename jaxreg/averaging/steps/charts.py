@@ -17,7 +17,8 @@ from jaxreg._core.typing import Scalar
 from jaxreg.averaging.steps.iterate import nearby_rotation
 from jaxreg.averaging.steps.levenberg_marquardt import Problem
 from jaxreg.geometry import lie
-from jaxreg.linear.small import product, root_semidefinite
+from jaxreg.graph.pose_graph import product
+from jaxreg.linear.small import root_semidefinite
 
 
 class Minimum(NamedTuple):

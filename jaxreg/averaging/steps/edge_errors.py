@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.brief import BriefModule
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
-from jaxreg.linear.small import product
+from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
 
 
 class AbstractEdgeError(BriefModule):

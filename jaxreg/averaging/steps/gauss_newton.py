@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 from jaxreg.averaging.steps.implicit import differentiable
 from jaxreg.averaging.steps.iterate import Iterated, TrustOf, WidthOf, held_width
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.linear.small import product
+from jaxreg.graph.pose_graph import PoseGraph, product
 
 
 def normal_equations(

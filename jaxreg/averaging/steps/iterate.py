@@ -16,10 +16,9 @@ from jaxreg.averaging.steps.implicit import differentiable
 from jaxreg.averaging.steps.rows import AbstractRows
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, product
 from jaxreg.linear.laplacian import solve_flow
 from jaxreg.linear.operator import divergence
-from jaxreg.linear.small import product
 
 
 #: Relative tolerance of a step's system: each step takes up what the last one left. On

@@ -32,10 +32,9 @@ from jaxreg.averaging.steps.edge_errors import AbstractEdgeError
 from jaxreg.averaging.steps.iterate import STEP_TOLERANCE, nearby_rotation, pose_change
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.pose_graph import PoseGraph, product
 from jaxreg.linear.multigrid import Multigrid, multigrid
 from jaxreg.linear.operator import GraphLaplacian, divergence, matmul
-from jaxreg.linear.small import product
 from jaxreg.linear.solvers import MultigridCG
 from jaxreg.robust import AbstractKernel
 
@@ -83,11 +82,11 @@ class Problem(NamedTuple):
         predicted = product(T_i_world[i], T[j])
         r = self.error.value(predicted, self.graph.T_i_j)
         # A left tangent of both ends turns the predicted motion from the right.
-        J = product(self.error.jacobian(predicted, r), lie.adjoint(T_i_world)[j])
+        J = matmul(self.error.jacobian(predicted, r), lie.adjoint(T_i_world)[j])
         WJ = self._weighted(J)
         force = jnp.sum(WJ * r[:, :, None], axis=-2)
         trust = self.trust(jnp.sum(r * self._weighted(r[..., None])[..., 0], axis=-1))
-        Q = product(jnp.swapaxes(J, -1, -2), trust[:, None, None] * WJ)
+        Q = matmul(jnp.swapaxes(J, -1, -2), trust[:, None, None] * WJ)
         return Q, trust[:, None] * force
 
 
