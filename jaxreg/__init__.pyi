@@ -11,7 +11,6 @@ from .averaging import MCC as MCC
 from .averaging import AbstractAverager as AbstractAverager
 from .averaging import AveragingSolution as AveragingSolution
 from .averaging import AveragingTrace as AveragingTrace
-from .averaging import Certificate as Certificate
 from .averaging import ChordalError as ChordalError
 from .averaging import Correntropy as Correntropy
 from .averaging import EdgeReport as EdgeReport
@@ -19,16 +18,19 @@ from .averaging import LogError as LogError
 from .averaging import LowRankSparse as LowRankSparse
 from .averaging import MotionAveraging as MotionAveraging
 from .averaging import PoseGraphLM as PoseGraphLM
-from .averaging import RiemannianStaircase as RiemannianStaircase
 from .averaging import RootRows as RootRows
 from .averaging import ShortestPaths as ShortestPaths
 from .averaging import SpanningTree as SpanningTree
 from .averaging import WeightedMotionAveraging as WeightedMotionAveraging
 from .averaging import WeightRows as WeightRows
 from .averaging import average as average
-from .averaging import certify as certify
 from .averaging import edge_report as edge_report
 from .averaging import pose_covariances as pose_covariances
+from .averaging.certificate import Certificate as Certificate
+from .averaging.certificate import certify as certify
+from .averaging.methods.riemannian_staircase import (
+    RiemannianStaircase as RiemannianStaircase,
+)
 from .correlation import KernelCorrelation as KernelCorrelation
 from .graph import PoseGraph as PoseGraph
 from .local import ICP as ICP

@@ -17,9 +17,9 @@ from jaxreg.averaging import (
     Correntropy,
     MotionAveraging,
     PoseGraphLM,
-    RiemannianStaircase,
     average,
 )
+from jaxreg.averaging.methods.riemannian_staircase import RiemannianStaircase
 from jaxreg.graph import PoseGraph
 from jaxreg.io.graphs.g2o import read_g2o
 from jaxreg.metrics import chordal_objective

@@ -44,7 +44,7 @@ class Certificate:
         status: CONVERGED where the poses are certified; UNCERTIFIED where not;
             DISCONNECTED where trusted edges do not hold all poses that are placed: the
             numbers then speak of the frames that are `covered`; NON_FINITE where poses
-            or trusted edges are not finite.
+            or trusted edges are not finite, or their squares.
         certified: whether the gap is at most `tolerance` of the objective, or what
             rounding to the dtype of the poses makes.
         objective: SE-Sync's objective F of the poses, over the trusted edges.
@@ -94,9 +94,9 @@ def certify(
         >>> far = [[1, 0, 2.3], [0, 1, 0], [0, 0, 1]]
         >>> graph = jr.PoseGraph.from_edges([(0, 1), (1, 2), (0, 2)], [east, east, far])
         >>> sol = jr.average(graph, jr.PoseGraphLM(jr.ChordalError()))
-        >>> jr.certify(graph, sol)
-        Certificate(certified: objective 0.03, no poses below 0.03,
-            3 of 3 poses, 3 edges, CONVERGED)
+        >>> found = jr.certify(graph, sol)
+        >>> found.certified, round(found.lower_bound, 4)
+        (True, 0.03)
 
     The objective is `jaxreg.metrics.chordal_objective` over the trusted edges, with the
     kappa and tau of `PoseGraphLM(ChordalError())`. The bound holds for all poses,
@@ -134,8 +134,9 @@ def certify(
     usable = trusted & np.asarray(graph.mask) & (kappa > 0) & (tau > 0)
     motions = np.asarray(graph.T_i_j, np.float64)
     sound: np.ndarray = np.isfinite(kappa + tau)
-    sound = sound & np.isfinite(motions).all(axis=(1, 2))
-    sound_poses: np.ndarray = np.asarray(np.isfinite(T).all(axis=(1, 2)))
+    # Also the squares, of which the matrices are made.
+    sound = sound & np.isfinite((kappa + tau) * _squares(motions))
+    sound_poses: np.ndarray = np.asarray(np.isfinite(_squares(T)))
     T = rigid(np.where(sound_poses[:, None, None], T, np.eye(T.shape[-1])))
     edges, keep = np.asarray(graph.edges), np.asarray(usable & sound)
     covered = joined(edges[keep], graph.num_poses)
@@ -217,6 +218,11 @@ def _concluded(
 
 
 _weights = jax.jit(chordal_weights)
+
+
+def _squares(T: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.sum(T**2, axis=(1, 2))
 
 
 def _checked(

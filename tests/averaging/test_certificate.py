@@ -15,10 +15,10 @@ from jaxreg.averaging import (
     ChordalError,
     Correntropy,
     PoseGraphLM,
-    RiemannianStaircase,
     average,
-    certify,
 )
+from jaxreg.averaging.certificate import certify
+from jaxreg.averaging.methods.riemannian_staircase import RiemannianStaircase
 from jaxreg.averaging.relaxation.certificate_matrix import CertificateMatrix
 from jaxreg.averaging.relaxation.connection import Connection, lifted
 from jaxreg.averaging.relaxation.staircase import climb
@@ -246,6 +246,11 @@ def test_small_and_broken_graphs():
     found = certify(pair, broken)
     assert found.status == Status.NON_FINITE
     assert not found.certified
+
+    one[0, 3] = 1e200  # whose square is not finite
+    endless = PoseGraph.from_edges([(0, 1), (1, 2)], [one, one])
+    found = certify(endless, average(endless, PoseGraphLM(ChordalError())))
+    assert found.status == Status.NON_FINITE
 
 
 def test_wrong_arguments_are_named():

@@ -52,6 +52,16 @@ def test_wrong_edges_stand_out_and_count_for_nothing():
     assert "degrees of freedom" in repr(report)
 
 
+def test_equations_without_a_solution_are_told():
+    _, edges, T, _ = random_graph(5, 10, 0.0, 2)
+    T[:, :-1, -1] *= 1e200  # whose squares are not finite
+    graph = PoseGraph.from_edges(edges, T, 5)
+    with np.errstate(over="ignore"):
+        report = edge_report(graph, average(graph, PoseGraphLM()))
+    assert report.trusted.any()
+    assert np.isnan(report.redundancy[report.trusted]).all()
+
+
 def test_a_solution_of_another_graph_is_refused():
     _, edges, T, _ = random_graph(5, 10, 0.0, 2)
     graph = PoseGraph.from_edges(edges, T, 5)

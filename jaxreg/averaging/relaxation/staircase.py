@@ -6,8 +6,7 @@ of a Stiefel manifold, r x d with orthonormal columns. Descending there by a Rie
 trust region, and adding rows as long as S is indefinite, ends at the minimum of the
 semidefinite relaxation; where the noise is not extreme, it has d rows after all.
 
-On the host: an exact factor of M preconditions every step. With a multigrid cycle in
-its place, in JAX, sphere2500 took 14 s from a good start.
+On the host: an exact factor of M preconditions every step.
 
 Reference: Rosen, Carlone, Bandeira, Leonard, SE-Sync, IJRR 2019; Boumal 2015; Absil,
 Baker, Gallivan 2007 (trust region).
