@@ -16,6 +16,7 @@ BASES = {
     "BriefModule": "gives a module its line for people, nothing else",
     "Options": "fields of all commands",
     "SearchOptions": "fields of the commands that search",
+    "ModelOptions": "fields of the commands that write scans in one frame",
 }
 #: Names of the top level but modules; more belong into namespaces.
 MOST_NAMES = 75
