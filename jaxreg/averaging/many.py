@@ -63,7 +63,8 @@ def average_list(
         starts = None if inits is None else [inits[k] for k in rows]
         lanes = _padded(some, starts, *padded_to)
         own_keys = None if keys is None else keys[rows]
-        found = _average_lanes(method, (*lanes, own_keys), batch_size, devices)
+        lanes = spread_rows(devices, (*lanes, own_keys))
+        found = _average_lanes(method, lanes, batch_size, devices)
         if is_concrete(found.status):
             found = jax.tree.map(np.asarray, found)  # slices compile nothing
         out |= {k: _cut(found, lane, checked[k]) for lane, k in enumerate(rows)}
@@ -90,7 +91,8 @@ def average_batch(
             )
         check_rigid(starts, "init")
     keys = None if key is None else jax.random.split(key, num)
-    return _average_lanes(method, (graphs, None, starts, keys), batch_size, devices)
+    lanes = spread_rows(devices, (graphs, None, starts, keys))
+    return _average_lanes(method, lanes, batch_size, devices)
 
 
 def _pieces(
@@ -178,7 +180,7 @@ def _average_lanes(
 
     if devices is None:
         return some(lanes)
-    return map_rows(devices, some, spread_rows(devices, lanes))
+    return map_rows(devices, some, lanes)
 
 
 def _cut(found: AveragingSolution, lane: int, graph: PoseGraph) -> AveragingSolution:

@@ -92,8 +92,10 @@ def map_rows(devices: Devices, function: Callable[[Tree], Out], rows: Tree) -> O
     return jax.tree.map(lambda x: _put(x, everywhere)[:num], out)
 
 
-def spread_rows(devices: Devices, rows: Tree) -> Tree:
+def spread_rows(devices: Devices | None, rows: Tree) -> Tree:
     """The same arrays, each row where it will be needed, without a program."""
+    if devices is None:
+        return rows
     num = len(jax.tree.leaves(rows)[0])
     if num % devices.size or isinstance(devices.mesh, AbstractMesh):
         return rows

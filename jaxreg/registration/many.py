@@ -150,8 +150,7 @@ def _register_groups(
     for members, of_rows in groups:
 
         def some(rows: np.ndarray, of_rows: Callable = of_rows) -> RegistrationSolution:
-            pairs = of_rows(rows)
-            pairs = pairs if devices is None else spread_rows(devices, pairs)
+            pairs = spread_rows(devices, of_rows(rows))
             return _register_rows(method, pairs, impl, batch_size, devices)
 
         rows = np.arange(len(members))

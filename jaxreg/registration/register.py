@@ -155,7 +155,8 @@ def register(
         number of devices that get several pairs each; on one device, and with one pair
         each, XLA rounds some sums otherwise. A number of pairs that is no multiple of
         the devices is filled up, which costs a copy. `register` also works inside
-        `jax.shard_map`; with its checks (`check_vma`) branches are computed both.
+        `jax.shard_map`; with its checks (`check_vma`) both branches of a condition are
+        computed.
 
     Memory:
         Groups of `batch_size` pairs are registered one after another on each core. On a
