@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxreg.app.colors import scan_colors
+from jaxreg.io.moved.motion import Moving
 from jaxreg.io.points.write_ply import write_ply
 
 
@@ -102,9 +103,7 @@ def write_merged(
         if own is not None:
             colors[mine] = own[row[mine]]
         if normals is not None and turned is not None:
-            A = T_world_i[k, :-1, :-1]
-            size = abs(np.linalg.det(A)) ** (1 / len(A))
-            normals[mine] = turned[row[mine]] @ A.T / size
+            normals[mine] = Moving(T_world_i[k]).directions(turned[row[mine]])
     write_ply(path, points, colors, normals=normals)
 
 

@@ -105,29 +105,7 @@ def _write(
                 np.asarray(sol.T_world_i)[placed],
                 timestamps=ids[placed],
             )
-        document = _document(sol, ids, objective)
-        document["edges"] = [
-            {
-                "i": int(ids[i]),
-                "j": int(ids[j]),
-                "weight": float(w),
-                "normalised_residual": float(report.normalised[row]),
-                "redundancy": float(report.redundancy[row]),
-            }
-            for row, ((i, j), w) in enumerate(
-                zip(
-                    np.asarray(graph.edges).tolist(),
-                    np.asarray(sol.edge_weight),
-                    strict=True,
-                )
-            )
-        ]
-        document["adjustment"] = {
-            "chi_square": report.chi_square,
-            "degrees_of_freedom": report.degrees_of_freedom,
-            "variance_factor": report.variance_factor,
-            "p_value": report.p_value if report.prior_noise else None,
-        }
+        document = _document(sol, ids, objective) | _adjusted(graph, sol, ids, report)
         document |= {
             "command": session.command,
             "seed": session.options.seed,
@@ -146,6 +124,31 @@ def _write(
                 details=outputs.page_details(session, document)
                 | {k: document[k] for k in ("objective_before", "objective_after")},
             )
+
+
+def _adjusted(
+    graph: PoseGraph, sol: AveragingSolution, ids: np.ndarray, report: EdgeReport
+) -> dict[str, Any]:
+    """What the adjustment says of each motion, and of all."""
+    edges, weights = np.asarray(graph.edges).tolist(), np.asarray(sol.edge_weight)
+    return {
+        "edges": [
+            {
+                "i": int(ids[i]),
+                "j": int(ids[j]),
+                "weight": float(weights[row]),
+                "normalised_residual": float(report.normalised[row]),
+                "redundancy": float(report.redundancy[row]),
+            }
+            for row, (i, j) in enumerate(edges)
+        ],
+        "adjustment": {
+            "chi_square": report.chi_square,
+            "degrees_of_freedom": report.degrees_of_freedom,
+            "variance_factor": report.variance_factor,
+            "p_value": report.p_value if report.prior_noise else None,
+        },
+    }
 
 
 def _document(
