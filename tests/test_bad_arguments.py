@@ -23,6 +23,7 @@ MOTIONS = problems.relative_motions(3, 0.0)[:-1].astype(np.float32)
 GRAPH = jr.PoseGraph.from_edges(problems.EDGES[:-1], MOTIONS)
 TWO_KEYS = jax.random.split(jax.random.key(0))
 TWO_GRAPHS = jax.tree.map(lambda x: jnp.stack([x, x]), GRAPH)
+FOUR_GRAPHS = jax.tree.map(lambda x: jnp.stack([x, x]), TWO_GRAPHS)
 CALLS: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (jr.register, {"source": CLOUD.astype("M8[s]")}, "source: wanted numbers"),
     (jr.register, {"source": iter(CLOUD)}, "source: .*numbers"),
@@ -30,7 +31,7 @@ CALLS: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (jr.register, {"source_mask": [[True], []]}, "source_mask: not a rectangular"),
     (jr.register, {"key": TWO_KEYS}, "key: wanted one key"),
     (jr.register, {"batch_size": 2**40}, "batch_size: wanted an integer below 2"),
-    (jr.average, {"graph": TWO_GRAPHS}, r"graph: wanted one graph, found .*\(2,\)"),
+    (jr.average, {"graph": FOUR_GRAPHS}, r"graph: .*leading axes \(2, 2\)"),
     (jr.average, {"init": 2 * POSES}, "init: wanted rigid motions"),
     (jr.average, {"init": 1e30 * POSES}, "init: wanted rigid motions"),
     (metrics.rotation_error, {"T_true_i": POSES[1:]}, "T_true_i: wanted shape"),

@@ -256,7 +256,7 @@ def test_small_and_broken_graphs():
 def test_wrong_arguments_are_named():
     graph = noisy(2)
     sol = average(graph, PoseGraphLM(ChordalError()))
-    with pytest.raises(TypeError, match="solution: wanted an AveragingSolution"):
+    with pytest.raises(TypeError, match="solution"):
         certify(graph, sol.T_world_i)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="min_trust"):
         certify(graph, sol, min_trust=1.5)
