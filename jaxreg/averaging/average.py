@@ -1,7 +1,7 @@
 """`average`: one pose per frame from relative motions."""
 
 from collections.abc import Sequence
-from typing import overload
+from typing import Any, overload
 
 from jax.sharding import AbstractMesh, Mesh
 
@@ -10,6 +10,8 @@ from jaxreg._core.log import log_solution
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
+from jaxreg.averaging.known import average_known
+from jaxreg.averaging.known_checks import check_known
 from jaxreg.averaging.many import average_batch, average_list, check_init
 from jaxreg.averaging.methods.correntropy import Correntropy
 from jaxreg.batching.devices import chosen_devices
@@ -26,6 +28,9 @@ def average(
     batch_size: int = 1,
     progress: Progress | None = None,
     mesh: Mesh | AbstractMesh | None = None,
+    priors: Sequence[tuple[Any, ...]] | None = None,
+    fixed: Sequence[tuple[Any, ...]] | None = None,
+    control: Sequence[tuple[Any, ...]] | None = None,
 ) -> AveragingSolution: ...
 
 
@@ -39,6 +44,9 @@ def average(
     batch_size: int = 1,
     progress: Progress | None = None,
     mesh: Mesh | AbstractMesh | None = None,
+    priors: Sequence[tuple[Any, ...]] | None = None,
+    fixed: Sequence[tuple[Any, ...]] | None = None,
+    control: Sequence[tuple[Any, ...]] | None = None,
 ) -> list[AveragingSolution]: ...
 
 
@@ -51,6 +59,9 @@ def average(
     batch_size: int = 1,
     progress: Progress | None = None,
     mesh: Mesh | AbstractMesh | None = None,
+    priors: Sequence[tuple[Any, ...]] | None = None,
+    fixed: Sequence[tuple[Any, ...]] | None = None,
+    control: Sequence[tuple[Any, ...]] | None = None,
 ) -> AveragingSolution | list[AveragingSolution]:
     """Finds poses that agree with relative motions: `T_i_j = inv(T_world_i) T_world_j`.
 
@@ -83,6 +94,20 @@ def average(
             done; not for one graph or a batch, not under `jit`.
         mesh: a mesh of devices with an axis "pair", over which many graphs are spread,
             as `register` spreads pairs: without it they stay where a batch is.
+        priors: what is nearly known of poses, a list of `(i, T_world_i)` or
+            `(i, T_world_i, information)`, of one graph alone. The poses are then in
+            their frame, and frame 0 is held by nothing else. Each is an edge from the
+            world, which robust methods trust or not: see `prior_weight`. Information
+            is of the right tangent error, as that of edges; without it a prior is as
+            good as the middle edge.
+        fixed: poses that are known exactly, a list of `(i, T_world_i)`. Edges between
+            them say nothing and have `edge_weight` 0.
+        control: surveyed points, a list of `(i, p_i, p_world)` or
+            `(i, p_i, p_world, information)`: frame i sees at `p_i` what lies at
+            `p_world`, such as a target, or, with `p_i` the place of the antenna, a
+            satellite fix. After `method` all is adjusted by `PoseGraphLM` with the
+            trust in edges held; up to half of the points may be wrong. Without priors
+            and fixed poses three that are on no line are needed (two in 2D).
 
     Returns:
         An `AveragingSolution`, with leading axes for a batch; for a list a list of
@@ -90,6 +115,7 @@ def average(
         frame 0 by edges of positive weight, see `placed`.
         NON_FINITE: edges or poses with NaN or inf were met; such edges are ignored,
         such poses returned as the identity.
+        DEGENERATE: the control points that agree lie on a line.
         MAX_STEPS: the steps ran out. NO_AGREEMENT: there are more motions than a tree
         needs, and nothing agrees beyond what any tree agrees with (`log_evidence` is
         at most 0, and so is that of the spanning tree of greatest weight); the poses
@@ -101,9 +127,15 @@ def average(
         ValueError: if `init` has another shape than the poses or is no rigid motion
             within 1e-2, a batch has several leading axes, the graphs of a list differ
             in dimension or in whether they have information, or the mesh has no axis
-            "pair".
+            "pair"; or if a row of `priors`, `fixed` or `control`, which is named, does
+            not fit the graph, has a singular information, or fixes a frame twice.
 
-    Gradients: see the method. `T_world_i` always follows `init[0]`.
+    Positions in the world may be map coordinates: in NumPy arrays of float64 they are
+    taken from the first before they are rounded to the dtype of the graph, and where
+    the answer needs them `T_world_i` is a NumPy array of float64.
+
+    Gradients: see the method. `T_world_i` always follows `init[0]`, or what is known;
+    with control points it is differentiated at the adjustment, trust held.
 
     Compilation: graphs of a list are padded to one of few numbers of poses, four an
     octave from 8 on, and to the edges of the largest that shares it; each such size
@@ -115,6 +147,12 @@ def average(
     check_count(batch_size, "batch_size")
     check_callable(progress, "progress")
     key = None if key is None else check_key(key)
+    told = priors is not None or fixed is not None or control is not None
+    many = isinstance(graph, list | tuple) or (
+        isinstance(graph, PoseGraph) and graph.edges.ndim == 3
+    )
+    if told and many:
+        raise ValueError("priors, fixed, control: of one graph, found many graphs.")
     if isinstance(graph, list | tuple):
         how = batch_size, progress, chosen_devices(mesh)
         return average_list(graph, method, init, key, *how)
@@ -122,6 +160,11 @@ def average(
     if isinstance(graph, PoseGraph) and graph.edges.ndim == 3:
         return average_batch(graph, method, init, key, batch_size, devices)
     one = check_graph(graph, "graph")
-    solution = average_graph(one, method, check_init(init, one, "init"), key)
+    start = check_init(init, one, "init")
+    known = check_known(priors, fixed, control, one) if told else None
+    if known is None:
+        solution = average_graph(one, method, start, key)
+    else:
+        solution = average_known(one, method, known, start, key)
     log_solution("average", solution)
     return solution

@@ -48,6 +48,8 @@ class AveragingSolution(eqx.Module):
             what a tree agrees with by itself; poses of one graph compare by it.
         length_scale: the length that stands for one radian; see `length_scale`.
         trace: how the method came to rest, or None if it takes no steps of its own.
+        prior_weight: `(p,)` how much each prior is trusted, then each control point,
+            from 0 to 1; 0 for priors of frames that are fixed. None without any.
     """
 
     T_world_i: Float[Array, "v D D"]
@@ -62,6 +64,7 @@ class AveragingSolution(eqx.Module):
     log_evidence: Float[Array, ""]
     length_scale: Float[Array, ""]
     trace: AveragingTrace | None = None
+    prior_weight: Float[Array, " p"] | None = None
 
     def in_unit(self, length: Float[Array, ""]) -> "AveragingSolution":
         """In another unit of length, which is `1 / length`."""

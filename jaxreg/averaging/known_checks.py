@@ -1,0 +1,213 @@
+"""What is known of poses and points, as arrays; a wrong row is refused by its name."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxreg._core.checks import (
+    as_host_array,
+    check_rigid,
+    is_concrete,
+    shown,
+)
+from jaxreg.averaging.control_points import ControlPoints
+from jaxreg.geometry import lie
+from jaxreg.graph.anchored import KnownPoses
+from jaxreg.graph.pose_graph import PoseGraph
+
+
+class Known(eqx.Module):
+    """Poses and points that are known.
+
+    Attributes:
+        poses: priors and fixed frames, or None without any.
+        points: control points, or None without any.
+        origin: `(d,)` float64 on the host, subtracted from all positions in the world,
+            which may be map coordinates; None where a number is traced.
+    """
+
+    poses: KnownPoses | None
+    points: ControlPoints | None
+    origin: np.ndarray | None = None
+
+
+def check_known(
+    priors: object, fixed: object, control: object, graph: PoseGraph
+) -> Known | None:
+    """What `average` is told; None if that is nothing."""
+    d = graph.dim
+    D, k = d + 1, lie.tangent_dim(d)
+    pose_rows = _rows(priors, "priors", graph, [(D, D), (k, k)])
+    fixed_rows = _rows(fixed, "fixed", graph, [(D, D)])
+    point_rows = _rows(control, "control", graph, [(d,), (d,), (d, d)])
+    if not (pose_rows or fixed_rows or point_rows):
+        return None
+    for name, rows in (("priors", pose_rows), ("fixed", fixed_rows)):
+        for n, row in enumerate(rows):
+            check_rigid(row[1], f"{name}[{n}]")
+    _check_twice(fixed_rows)
+    if point_rows and not (pose_rows or fixed_rows) and len(point_rows) < d:
+        raise ValueError(
+            f"control: wanted at least {d} points, or a prior or a fixed frame beside "
+            f"them, found {len(point_rows)}."
+        )
+    places = [T[:-1, -1] for _, T, *_ in fixed_rows + pose_rows]
+    places += [row[2] for row in point_rows]
+    origin = None
+    if all(isinstance(x, np.ndarray) and np.isfinite(x).all() for x in places):
+        origin = np.array(places[0], np.float64)
+    shift = np.zeros(d) if origin is None else origin
+    poses = _known_poses(pose_rows, fixed_rows, shift, graph)
+    points = _control_points(point_rows, shift, graph)
+    return Known(poses, points, origin)
+
+
+def _rows(
+    given: object, name: str, graph: PoseGraph, shapes: list[tuple[int, ...]]
+) -> list[tuple[Any, ...]]:
+    """Frame, arrays, and None for an information that is left out."""
+    if given is None:
+        return []
+    if not isinstance(given, Sequence) or isinstance(given, str | bytes):
+        raise TypeError(f"{name}: wanted a list of tuples, found {shown(given)}.")
+    least = len(shapes) - (name != "fixed")
+    out = []
+    for n, row in enumerate(given):
+        at = f"{name}[{n}]"
+        if not isinstance(row, list | tuple) or not (
+            least < len(row) <= len(shapes) + 1
+        ):
+            raise TypeError(f"{at}: wanted {_WANTED[name]}, found {shown(row)}.")
+        frame = row[0]
+        if isinstance(frame, bool) or not isinstance(frame, int | np.integer):
+            raise TypeError(f"{at}: wanted a frame's number, found {shown(frame)}.")
+        if not 0 <= frame < graph.num_poses:
+            raise ValueError(
+                f"{at}: wanted a frame below {graph.num_poses}, found {frame}."
+            )
+        arrays = [
+            None if x is None else _array(x, at, shape)
+            for x, shape in zip(row[1:], shapes, strict=False)
+        ]
+        if any(x is None for x in arrays[:least]):
+            raise TypeError(f"{at}: wanted {_WANTED[name]}, found None in it.")
+        arrays += [None] * (len(shapes) - len(arrays))
+        if name != "fixed":
+            eps = float(jnp.finfo(graph.T_i_j.dtype).eps)
+            _check_definite(arrays[-1], at, eps)
+        out.append((int(frame), *arrays))
+    return out
+
+
+_WANTED = {
+    "priors": "(frame, T_world_i) or (frame, T_world_i, information)",
+    "fixed": "(frame, T_world_i)",
+    "control": "(frame, point in it, point in the world), and an information if known",
+}
+
+
+def _array(x: object, at: str, shape: tuple[int, ...]) -> Any:
+    """Of concrete numbers float64 on the host: map coordinates are long."""
+    if isinstance(x, jax.Array) and not is_concrete(x):
+        found = x
+    else:
+        found = as_host_array(x, at).astype(np.float64)
+    if found.shape != shape:
+        raise ValueError(f"{at}: wanted shape {shape}, found {found.shape}.")
+    return found
+
+
+def _check_definite(information: Any, at: str, eps: float) -> None:
+    if not isinstance(information, np.ndarray):
+        return
+    if not np.allclose(information, information.T, rtol=1e-4):
+        raise ValueError(f"{at}: information: wanted a symmetric matrix.")
+    least, *_, most = np.linalg.eigvalsh(information)
+    if not least > eps * most:
+        raise ValueError(
+            f"{at}: information: wanted a positive definite matrix, found eigenvalues "
+            f"from {least:.3g} to {most:.3g}. Of a position alone `control` is told."
+        )
+
+
+def _check_twice(rows: list[tuple[Any, ...]]) -> None:
+    seen: dict[int, int] = {}
+    for n, (frame, *_) in enumerate(rows):
+        if frame in seen:
+            raise ValueError(
+                f"fixed[{n}]: frame {frame} is fixed by fixed[{seen[frame]}] already."
+            )
+        seen[frame] = n
+
+
+def _known_poses(
+    priors: list[tuple[Any, ...]],
+    fixed: list[tuple[Any, ...]],
+    origin: np.ndarray,
+    graph: PoseGraph,
+) -> KnownPoses | None:
+    if not (priors or fixed):
+        return None
+    dtype, D = graph.T_i_j.dtype, graph.dim + 1
+    shift = np.zeros((D, D))
+    shift[:-1, -1] = origin
+    v = graph.num_poses
+    rows = np.array([frame for frame, _ in fixed], np.int32)
+    is_fixed = np.zeros(v, bool)
+    is_fixed[rows] = True
+    T_fixed = jnp.broadcast_to(jnp.eye(D, dtype=dtype), (v, D, D))
+    if fixed:
+        own = jnp.stack([jnp.asarray(T - shift, dtype) for _, T in fixed])
+        T_fixed = T_fixed.at[rows].set(own)
+    T_prior = jnp.zeros((0, D, D), dtype)
+    if priors:
+        T_prior = jnp.stack([jnp.asarray(T - shift, dtype) for _, T, _ in priors])
+    frame = np.array([frame for frame, *_ in priors], np.int32)
+    given = [info for *_, info in priors]
+    information = _information(given, graph)
+    return KnownPoses(
+        jnp.asarray(frame), T_prior, information, jnp.asarray(is_fixed), T_fixed
+    )
+
+
+def _information(given: list[Any], graph: PoseGraph) -> Any:
+    """Of priors; those that tell none are as good as the middle edge."""
+    info = graph.information
+    if info is None:
+        told = [n for n, x in enumerate(given) if x is not None]
+        if told:
+            raise ValueError(
+                f"priors[{told[0]}]: information: the graph has none to compare it "
+                "with; leave it out, or give the edges theirs."
+            )
+        return None
+    k, dtype = info.shape[-1], info.dtype
+    each = jnp.where(graph.mask[:, None], jnp.diagonal(info, axis1=1, axis2=2), jnp.nan)
+    middle = jnp.diag(jnp.nanmedian(each, axis=0))
+    rows = [middle if x is None else jnp.asarray(x, dtype) for x in given]
+    return jnp.stack(rows) if rows else jnp.zeros((0, k, k), dtype)
+
+
+def _control_points(
+    rows: list[tuple[Any, ...]], origin: np.ndarray, graph: PoseGraph
+) -> ControlPoints | None:
+    if not rows:
+        return None
+    dtype = graph.T_i_j.dtype
+    given = [info for *_, info in rows]
+    told = [n for n, x in enumerate(given) if x is not None]
+    if told and len(told) < len(rows):
+        missing = next(n for n, x in enumerate(given) if x is None)
+        raise ValueError(
+            f"control[{missing}]: wanted an information, as control[{told[0]}] has one."
+        )
+    return ControlPoints(
+        frame=jnp.asarray(np.array([row[0] for row in rows], np.int32)),
+        in_frame=jnp.stack([jnp.asarray(row[1], dtype) for row in rows]),
+        in_world=jnp.stack([jnp.asarray(row[2] - origin, dtype) for row in rows]),
+        information=jnp.stack([jnp.asarray(x, dtype) for x in given]) if told else None,
+    )
