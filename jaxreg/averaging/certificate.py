@@ -20,8 +20,8 @@ import numpy as np
 from jaxreg._core.arrays import widened
 from jaxreg._core.checks import as_host_numbers, is_concrete, shown
 from jaxreg._core.status import Status
+from jaxreg.averaging.adjusted import check_solution
 from jaxreg.averaging.base import AveragingSolution
-from jaxreg.averaging.covariance import check_solution
 from jaxreg.averaging.relaxation.certificate_matrix import CertificateMatrix
 from jaxreg.averaging.relaxation.connection import (
     Connection,
@@ -237,6 +237,11 @@ def _checked(
     if any(not is_concrete(x) for x in leaves):
         raise TypeError("certify: works on the host, not inside jit, vmap or grad.")
     check_solution(graph, solution)
+    if solution.prior_weight is not None:
+        raise ValueError(
+            "solution: wanted one of the graph alone, found one with priors, fixed "
+            "poses or control points."
+        )
     for name, value in (("min_trust", min_trust), ("tolerance", tolerance)):
         found = as_host_numbers(value, name)
         if found.ndim or not 0 <= found < 1:

@@ -1,47 +1,37 @@
 """Poses moved to surveyed points: a robust fit, then one adjustment of all.
 
 A control point seen from frame i at u lies at q in the world. Its misfit
-R_i' (T_world_i u - q) is linear in the right tangent of the pose, J = [I, -[u]x], so
-that it is an edge from the world to (R_i, q - R_i u) of information J' W J, which says
-nothing of what one point leaves free.
+a = R_i' (T_world_i u - q) changes with the right tangent of the pose by [I, -[u]x]. So
+it is an edge from the world to (R_i, q - R_i u), whose error is (a, 0), of information
+J' W J with J = [I, -[u + a / 2]x] (the half: the logarithm of a motion turns its
+translation back by half of its turn). It says nothing of what one point leaves free.
 
 Reference: Triggs et al. 2000, "Bundle adjustment: a modern synthesis" (gauge by control
 points).
 """
 
-import itertools
 import math
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core import control
 from jaxreg._core.status import Status
 from jaxreg._core.typing import StatusArray
 from jaxreg.averaging.base import AveragingSolution
-from jaxreg.averaging.covariance import deviations
+from jaxreg.averaging.control_fit import DEVIATIONS, likeliest_place, spans
 from jaxreg.averaging.gauge import average_graph
-from jaxreg.averaging.measures import length_scale, nearest_rank
+from jaxreg.averaging.measures import deviations, length_scale, nearest_rank
 from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM
 from jaxreg.geometry import lie
-from jaxreg.geometry.kabsch import kabsch
 from jaxreg.graph.anchored import KnownPoses, anchored
 from jaxreg.graph.pose_graph import PoseGraph, product
 
 
-#: Choices of points for the robust fit: half of the points may be wrong, then one of
-#: eight choices of three is right, and none of 256 with a chance of 1e-15.
-_CHOICES = 256
 #: Adjustments, each with the trust that the one before leaves.
 _ROUNDS = 4
-#: Deviations that a right point may be off: those of a hundredth of right ones are
-#: larger (chi-square of three components).
-_DEVIATIONS = 3.4
-#: Deviations of right points that are tried, as shares of their extent.
-_LADDER = tuple(0.3 / 2 ** (n / 2) for n in range(32))
 #: The median length of a vector of d normal numbers.
 _MEDIAN_LENGTH = {2: math.sqrt(1.3863), 3: math.sqrt(2.3660)}
 
@@ -81,20 +71,22 @@ def fitted(
     held, points_held = jax.lax.stop_gradient((found, points))
     T = held.T_world_i
     if poses is None:
-        T = product(_T_world_0(points_held, T, held.placed[points.frame]), T)
-    problem = _Adjustment(graph, poses, points, found)
+        usable = held.placed[points.frame]
+        seen = _moved(points_held, T)
+        T = product(likeliest_place(seen, points_held.in_world, usable), T)
+    problem = Adjustment(graph, poses, points, found)
     fixed = jax.lax.stop_gradient(problem)
 
     def again(_: Array, T: Array) -> Array:
         return fixed.minimum(T)[0]
 
     T = jax.lax.stop_gradient(control.fori_loop(0, _ROUNDS - 1, again, T))
-    T_world_i, ended = problem.minimum(T)
-    trust = _trust(points, T_world_i, found.placed)[0]
+    T_world_i, ended, trust = problem.minimum(T)
+    trust = trust[-len(points.frame) :]
     before = found.prior_weight
     status = jnp.where(found.status == Status.CONVERGED, ended, found.status)
     if poses is None:
-        status = jnp.where(_spans(points, trust), status, Status.DEGENERATE)
+        status = jnp.where(spans(points.in_world, trust), status, Status.DEGENERATE)
     return eqx.tree_at(
         lambda s: (s.T_world_i, s.prior_weight, s.status),
         found,
@@ -107,7 +99,7 @@ def fitted(
     )
 
 
-class _Adjustment(eqx.Module):
+class Adjustment(eqx.Module):
     """Edges, priors and points as one graph, by the trust that poses give them."""
 
     graph: PoseGraph
@@ -115,32 +107,31 @@ class _Adjustment(eqx.Module):
     points: ControlPoints
     found: AveragingSolution
 
-    def minimum(self, T: Float[Array, "v D D"]) -> tuple[Array, StatusArray]:
-        """The poses, from those before, and a status."""
+    def minimum(self, T: Float[Array, "v D D"]) -> tuple[Array, StatusArray, Array]:
+        """The poses, from those before, a status, and the trust that they are by."""
+        graph, known, trust = self.whole(T)
+        whole = anchored(graph, known)
+        whole = eqx.tree_at(lambda g: g.weight, whole, whole.weight * trust)
+        start = jnp.concatenate([jnp.eye(graph.dim + 1, dtype=T.dtype)[None], T])
+        moved = self.found.placed & ~known.fixed
+        present = jnp.append(True, moved)
+        end = average_graph(whole, PoseGraphLM(), start, None, present)
+        return jnp.where(moved[:, None, None], end.T_world_i[1:], T), end.status, trust
+
+    def whole(
+        self, T: Float[Array, "v D D"]
+    ) -> tuple[PoseGraph, KnownPoses, Float[Array, " n"]]:
+        """The graph with information, all that is known as priors, and the trust."""
         graph, found = self.graph, jax.lax.stop_gradient(self.found)
         # What is left of wrong edges would widen the noise.
         trust = jnp.where(found.edge_weight > 0.5, found.edge_weight, 0)
         if graph.information is None:
-            noise = jax.lax.stop_gradient(deviations(graph, T, trust))
-            least = 1e-5 * jnp.stack([length_scale(graph), jnp.ones_like(noise[0])])
-            noise = jnp.maximum(noise, least)
-            d, k = graph.dim, lie.tangent_dim(graph.dim)
-            W = jnp.diag(
-                jnp.repeat(noise**-2, np.array([d, k - d]), total_repeat_length=k)
-            )
-            info = jnp.broadcast_to(W, (graph.num_edges, k, k))
+            info = _shown_information(graph, jax.lax.stop_gradient(T), trust)
             graph = eqx.tree_at(
                 lambda g: g.information, graph, info, is_leaf=lambda x: x is None
             )
         known, weight = self._known(graph, T)
-        whole = anchored(graph, known)
-        trusted = jnp.concatenate([trust, weight])
-        whole = eqx.tree_at(lambda g: g.weight, whole, whole.weight * trusted)
-        start = jnp.concatenate([jnp.eye(graph.dim + 1, dtype=T.dtype)[None], T])
-        present = jnp.append(True, found.placed & ~known.fixed)
-        end = average_graph(whole, PoseGraphLM(), start, None, present)
-        moved = present[1:, None, None]
-        return jnp.where(moved, end.T_world_i[1:], T), end.status
+        return graph, known, jnp.concatenate([trust, weight])
 
     def _known(self, graph: PoseGraph, T: Array) -> tuple[KnownPoses, Array]:
         """Priors and control points as priors, and their weights."""
@@ -148,7 +139,8 @@ class _Adjustment(eqx.Module):
         trust, size = _trust(jax.lax.stop_gradient(points), T, self.found.placed)
         R = lie.rotation(T[points.frame])
         t = points.in_world - _turned(R, points.in_frame)
-        J = _by_tangent(points.in_frame)
+        off = _turned(jnp.swapaxes(R, -1, -2), _moved(points, T) - points.in_world)
+        J = _by_tangent(points.in_frame + jax.lax.stop_gradient(off) / 2)
         W = points.information
         if W is None:
             W = jnp.eye(graph.dim, dtype=dtype) / size**2
@@ -180,6 +172,15 @@ class _Adjustment(eqx.Module):
         return both, jnp.concatenate([jax.lax.stop_gradient(before), trust])
 
 
+def _shown_information(graph: PoseGraph, T: Array, trust: Array) -> Array:
+    """Of the noise that the trusted edges leave."""
+    d, k = graph.dim, lie.tangent_dim(graph.dim)
+    least = 1e-5 * jnp.stack([length_scale(graph), jnp.ones((), T.dtype)])
+    noise = jnp.maximum(deviations(graph, T, trust), least)
+    each = jnp.concatenate([jnp.full(d, noise[0]), jnp.full(k - d, noise[1])])
+    return jnp.broadcast_to(jnp.diag(each**-2), (graph.num_edges, k, k))
+
+
 def _usual_information(graph: PoseGraph, given: Array | None, num: int) -> Array:
     if given is not None:
         return given
@@ -189,6 +190,12 @@ def _usual_information(graph: PoseGraph, given: Array | None, num: int) -> Array
 
 def _turned(R: Float[Array, "c d d"], x: Float[Array, "c d"]) -> Float[Array, "c d"]:
     return jnp.sum(R * x[:, None, :], axis=-1)
+
+
+def _moved(points: ControlPoints, T: Float[Array, "v D D"]) -> Float[Array, "c d"]:
+    """By the poses of their frames."""
+    at = T[points.frame]
+    return _turned(lie.rotation(at), points.in_frame) + lie.translation(at)
 
 
 def _by_tangent(u: Float[Array, "c d"]) -> Float[Array, "c d k"]:
@@ -208,9 +215,7 @@ def _by_tangent(u: Float[Array, "c d"]) -> Float[Array, "c d k"]:
 
 def _misfit(points: ControlPoints, T: Float[Array, "v D D"]) -> Float[Array, " c"]:
     """In standard deviations, or in lengths if none are known."""
-    at = T[points.frame]
-    off = _turned(lie.rotation(at), points.in_frame) + lie.translation(at)
-    off = off - points.in_world
+    off = _moved(points, T) - points.in_world
     if points.information is None:
         return jnp.linalg.norm(off, axis=-1)
     sq = jnp.sum(off * _turned(points.information, off), axis=-1)
@@ -228,75 +233,5 @@ def _trust(
     lengths = jnp.max(jnp.abs(points.in_world - points.in_world[:1]))
     least = 1e-6 * lengths if points.information is None else jnp.ones_like(size)
     size = jnp.maximum(size, jnp.maximum(least, jnp.finfo(size.dtype).tiny ** 0.5))
-    trust = jnp.exp(-((off / (_DEVIATIONS * size)) ** 2) / 2)
+    trust = jnp.exp(-((off / (DEVIATIONS * size)) ** 2) / 2)
     return jnp.where(usable, trust, 0), size
-
-
-def _T_world_0(
-    points: ControlPoints, T_0_i: Float[Array, "v D D"], usable: Array
-) -> Float[Array, "D D"]:
-    """The likeliest place of frame 0, all poses moved as one body."""
-    at = T_0_i[points.frame]
-    seen = _turned(lie.rotation(at), points.in_frame) + lie.translation(at)
-    num, d = seen.shape
-    rows = jnp.asarray(_choices(num, min(d, num)))
-    present = usable.astype(seen.dtype)
-    tried = jax.vmap(lambda r: kabsch(seen[r], points.in_world[r], present[r]))(rows)
-
-    def squares(T: Array) -> Array:
-        moved = jnp.sum(lie.rotation(T) * seen[:, None], axis=-1) + lie.translation(T)
-        return jnp.sum((moved - points.in_world) ** 2, axis=-1)
-
-    extent = jnp.max(jnp.linalg.norm(points.in_world - points.in_world[:1], axis=-1))
-    extent = jnp.where(extent > 0, extent, 1)
-    scores, sizes = jax.vmap(lambda T: _log_evidence(squares(T), present, extent, d))(
-        tried
-    )
-    whole = jnp.all(usable[rows], axis=1)
-    first = jnp.argmax(jnp.where(whole, scores, -jnp.inf))
-    size = sizes[first]
-
-    def closer(_: Array, T: Array) -> Array:
-        w = jnp.exp(-squares(T) / (_DEVIATIONS * size) ** 2 / 2)
-        return kabsch(seen, points.in_world, present * w)
-
-    return control.fori_loop(0, 5, closer, tried[first])
-
-
-def _log_evidence(
-    sq: Float[Array, " c"], present: Array, extent: Array, d: int
-) -> tuple[Array, Array]:
-    """The likeliest deviation of right points, and how likely.
-
-    A point is right or wrong with even odds, and lies anywhere in the extent if wrong.
-    A motion fits k / d points whatever they are, which are taken off.
-    """
-    deviation = extent * jnp.asarray(_LADDER, sq.dtype)
-    gain = d * jnp.log(extent / deviation)
-    each = jax.nn.softplus(gain[:, None] - sq / (2 * deviation[:, None] ** 2))
-    free = lie.tangent_dim(d) / d
-    total = jnp.sum(present * each, axis=1) - free * gain
-    best = jnp.argmax(total)
-    return total[best], deviation[best]
-
-
-def _choices(num: int, size: int) -> np.ndarray:
-    """Rows of points to fit, all choices if they are few; no key is needed."""
-    if math.comb(num, size) <= _CHOICES:
-        return np.array(list(itertools.combinations(range(num), size)))
-    draw = np.random.default_rng(0)
-    return np.stack([draw.choice(num, size, replace=False) for _ in range(_CHOICES)])
-
-
-def _spans(points: ControlPoints, trust: Array) -> Array:
-    """Whether the trusted points hold every turn: they lie on no line, in 2D apart."""
-    w = jnp.where(trust > 0.5, 1.0, 0.0).astype(points.in_world.dtype)
-    mean = jnp.sum(w[:, None] * points.in_world, axis=0) / jnp.maximum(jnp.sum(w), 1)
-    off = (points.in_world - mean) * w[:, None]
-    spread = jnp.sum(off[:, :, None] * off[:, None, :], axis=0)
-    whole = jnp.trace(spread)
-    if points.in_world.shape[-1] == 2:
-        return whole > 0
-    # The sum of the minors: the products of two of the squared widths.
-    minors = (whole**2 - jnp.sum(spread**2)) / 2
-    return minors > 1e-6 * whole**2

@@ -5,15 +5,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg._core.checks import check_count, shown
+from jaxreg._core.checks import check_count
+from jaxreg.averaging.adjusted import Told, as_adjusted
 from jaxreg.averaging.base import AveragingSolution
+from jaxreg.averaging.measures import deviations
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
+from jaxreg.graph.pose_graph import PoseGraph
 
 
 def pose_covariances(
-    graph: PoseGraph, solution: AveragingSolution, *, max_unknowns: int = 6000
+    graph: PoseGraph,
+    solution: AveragingSolution,
+    *,
+    max_unknowns: int = 6000,
+    priors: Told = None,
+    fixed: Told = None,
+    control: Told = None,
 ) -> Float[Array, "v k k"]:
     """The marginal covariance of each pose, with frame 0 known exactly.
 
@@ -28,9 +36,13 @@ def pose_covariances(
         solution: its solution, from any method.
         max_unknowns: k per frame, at most; the matrix is dense, 144 MB of float32 for
             the default (static).
+        priors: those that `average` was given; then frame 0 is held by nothing else.
+        fixed: likewise.
+        control: likewise.
 
     Returns:
-        `(v, k, k)`; 0 for frame 0, NaN for frames that no trusted edge holds.
+        `(v, k, k)`; 0 for frame 0, or for fixed frames; NaN for frames that no trusted
+        edge holds.
 
     Raises:
         ValueError: for more unknowns than `max_unknowns`, and for a solution of another
@@ -39,7 +51,7 @@ def pose_covariances(
 
     Gradients: none (cut).
     """
-    check_solution(graph, solution)
+    whole, placed, first = as_adjusted(graph, solution, priors, fixed, control)
     check_count(max_unknowns, "max_unknowns")
     k = lie.tangent_dim(graph.dim)
     if graph.num_poses * k > max_unknowns:
@@ -47,22 +59,9 @@ def pose_covariances(
             f"graph: wanted at most {max_unknowns // k} poses for covariances, "
             f"found {graph.num_poses}."
         )
-    return _covariances(graph, solution)
-
-
-def check_solution(graph: PoseGraph, solution: AveragingSolution) -> None:
-    """Requires a graph and a solution of it."""
-    check_graph(graph, "graph")
-    if not isinstance(solution, AveragingSolution):
-        raise TypeError(
-            f"solution: wanted an AveragingSolution, found {shown(solution)}."
-        )
-    check_poses(solution.T_world_i, "solution: T_world_i", graph)
-    if solution.edge_weight.shape != graph.weight.shape:
-        raise ValueError(
-            f"solution: wanted one of {graph.num_edges} edges, found "
-            f"{solution.edge_weight.shape}."
-        )
+    covariances = _covariances(whole, placed)[first:]
+    frames = [row[0] for row in fixed or ()]
+    return covariances.at[jnp.asarray(frames, jnp.int32)].set(0)
 
 
 @eqx.filter_jit
@@ -91,19 +90,3 @@ def _covariances(
     known = solution.placed & (touched > 0)
     blocks = jnp.where(known[:, None, None], blocks, jnp.nan)
     return blocks.at[0].set(0)
-
-
-def deviations(graph: PoseGraph, T: Array, trust: Array) -> Float[Array, "2"]:
-    """Of one component of a translation and of a rotation, by the trusted edges."""
-    d, k = graph.dim, lie.tangent_dim(graph.dim)
-    rotation, translation = graph.differences(T)
-    w = graph.weight * trust
-    count = jnp.sum(jnp.where(graph.mask, trust, 0))
-    spare = jnp.maximum(count - (graph.num_poses - 1), 1)
-    mean = jnp.stack(
-        [
-            jnp.sum(w * jnp.where(w > 0, translation, 0)) / d,
-            jnp.sum(w * jnp.where(w > 0, rotation, 0)) / (2 * (k - d)),
-        ]
-    )
-    return jnp.maximum(jnp.sqrt(mean / spare), 8 * jnp.finfo(T.dtype).eps)

@@ -9,8 +9,9 @@ import scipy.special
 
 from jaxreg._core.arrays import widened
 from jaxreg._core.checks import check_count
+from jaxreg.averaging.adjusted import Told, as_adjusted
 from jaxreg.averaging.base import AveragingSolution
-from jaxreg.averaging.covariance import check_solution, deviations
+from jaxreg.averaging.measures import deviations
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph, product
@@ -21,12 +22,14 @@ class EdgeReport:
     """Residuals of an adjustment. NumPy arrays, float64.
 
     Attributes:
-        edges: `(e, 2)` frames i and j.
+        edges: `(e, 2)` frames i and j; of priors and control points, which follow the
+            edges of the graph, i is -1, the world.
         trusted: `(e,)` whether an edge is part of the adjustment.
         rotation: `(e,)` size of the residual, radians.
         translation: `(e,)` size of the residual, unit of the graph.
-        normalised: `(e,)` root mean square of the residual's k components in a-priori
-            standard deviations, sqrt(r' Omega r / k); also of edges not trusted.
+        normalised: `(e,)` root mean square of the residual's components in a-priori
+            standard deviations, sqrt(r' Omega r / k), with k the rank of Omega; also of
+            edges not trusted.
         redundancy: `(e,)` the redundancy number, mean over the k components: the share
             of an error in the motion that shows in its residual. 0 where nothing checks
             an edge, near 1 where others fix both its frames. 1 for edges not trusted;
@@ -70,6 +73,9 @@ def edge_report(
     *,
     min_trust: float = 0.5,
     max_unknowns: int = 6000,
+    priors: Told = None,
+    fixed: Told = None,
+    control: Told = None,
 ) -> EdgeReport:
     """Residuals, chi-square and redundancy numbers of averaged poses.
 
@@ -92,6 +98,9 @@ def edge_report(
         min_trust: edges whose `edge_weight` is above it are trusted.
         max_unknowns: k per frame, at most, for redundancy numbers, which come from a
             dense inverse in float64.
+        priors: those that `average` was given; they are rows after the edges.
+        fixed: likewise; fixed frames are no unknowns.
+        control: likewise; rows after the priors, of d components.
 
     Raises:
         TypeError: for anything but a graph and a solution.
@@ -101,7 +110,8 @@ def edge_report(
 
     Reference: Baarda 1968; Foerstner 1987 (redundancy numbers).
     """
-    check_solution(graph, solution)
+    prior_noise, own = graph.information is not None, np.asarray(graph.edges)
+    graph, solution, first = as_adjusted(graph, solution, priors, fixed, control)
     check_count(max_unknowns, "max_unknowns")
     with jax.enable_x64(True):
         wide, T = widened((graph, solution.T_world_i))
@@ -117,20 +127,20 @@ def edge_report(
             Omega = Omega / noise[1] ** 2
         r = np.where(sound[:, None], np.asarray(wide.tangent_errors(T)), np.nan)
         weights = np.asarray(Omega)
-        k = r.shape[1]
+        k, ranks = r.shape[1], _ranks(weights)
         redundancy = np.full(len(r), np.nan)
         if graph.num_poses * k <= max_unknowns:
             W = jnp.where(trusted[:, None, None], Omega, 0)
-            redundancy = np.where(trusted, _redundancy(wide, T, W) / k, 1.0)
+            redundancy = np.where(trusted, _redundancy(wide, T, W, ranks), 1.0)
     square = np.einsum("ea,eab,eb->e", r, weights, r)
     held = np.unique(np.append(np.asarray(graph.edges)[trusted], 0))
-    spare = k * (int(trusted.sum()) - (len(held) - 1))
+    spare = int(ranks[trusted].sum()) - k * (len(held) - 1)
     total = float(square[trusted].sum())
-    normalised = np.sqrt(square / k)
+    normalised = np.sqrt(square / np.maximum(ranks, 1))
     order = np.argsort(-np.where(trusted, normalised, -1), kind="stable")
     d = graph.dim
     return EdgeReport(
-        edges=np.asarray(graph.edges),
+        edges=np.concatenate([own, np.asarray(graph.edges)[len(own) :] - first]),
         trusted=trusted,
         rotation=np.linalg.norm(r[:, d:], axis=1),
         translation=np.linalg.norm(r[:, :d], axis=1),
@@ -142,15 +152,25 @@ def edge_report(
         p_value=float(scipy.special.chdtrc(spare, total))
         if spare > 0
         else float("nan"),
-        prior_noise=graph.information is not None,
+        prior_noise=prior_noise,
         worst=order[: min(10, int(trusted.sum()))],
     )
 
 
-def _redundancy(graph: PoseGraph, T: jax.Array, W: jax.Array) -> np.ndarray:
-    """`(e,)` k less the trace of W A inv(A' W A) A' for each edge's rows A."""
+def _ranks(Omega: np.ndarray) -> np.ndarray:
+    """`(e,)` components of which an information says something."""
+    sizes = np.linalg.eigvalsh(np.where(np.isfinite(Omega), Omega, 0))
+    return np.sum(sizes > 1e-9 * sizes[:, -1:], axis=1)
+
+
+def _redundancy(
+    graph: PoseGraph, T: jax.Array, W: jax.Array, ranks: np.ndarray
+) -> np.ndarray:
+    """`(e,)` 1 less the mean of W A inv(A' W A) A' over each edge's components A."""
     num, k = graph.num_poses, W.shape[-1]
-    H = np.asarray(normal_equations(graph, T, W)[0])
+    H = np.array(normal_equations(graph, T, W)[0])
+    idle = np.diagonal(H) == 0  # of frames without edges
+    H[idle, idle] = 1
     try:
         C = np.linalg.inv(H).reshape(num, k, num, k).swapaxes(1, 2)
     except np.linalg.LinAlgError:  # numbers too large, or too unlike
@@ -161,4 +181,5 @@ def _redundancy(graph: PoseGraph, T: jax.Array, W: jax.Array) -> np.ndarray:
     Jt = J.swapaxes(1, 2)
     cross = J @ C[i, j]
     covariance = J @ C[i, i] @ Jt + cross + cross.swapaxes(1, 2) + C[j, j]
-    return k - np.einsum("eab,eba->e", np.asarray(W), covariance)
+    explained = np.einsum("eab,eba->e", np.asarray(W), covariance)
+    return 1 - explained / np.maximum(ranks, 1)

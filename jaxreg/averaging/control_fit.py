@@ -1,0 +1,97 @@
+"""The place of one rigid body that brings it to surveyed points, half of them wrong."""
+
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core import control
+from jaxreg.geometry import lie
+from jaxreg.geometry.kabsch import kabsch
+
+
+#: Choices of points to fit: where half are wrong one of eight choices of three is
+#: right, and none of 256 with a chance of 1e-15.
+_CHOICES = 256
+#: Deviations of right points that are tried, as shares of their extent.
+_LADDER = tuple(0.3 / 2 ** (n / 2) for n in range(32))
+#: Deviations that a right point may be off: those of a hundredth of right ones are
+#: larger (chi-square of three components).
+DEVIATIONS = 3.4
+
+
+def likeliest_place(
+    seen: Float[Array, "c d"], in_world: Float[Array, "c d"], usable: Bool[Array, " c"]
+) -> Float[Array, "D D"]:
+    """`T_world_body`, the likeliest over the choices, then by all that agree with it.
+
+    Args:
+        seen: points of the body.
+        in_world: where they lie in the world.
+        usable: those that count.
+    """
+    num, d = seen.shape
+    rows = jnp.asarray(_choices(num, min(d, num)))
+    present = usable.astype(seen.dtype)
+    tried = jax.vmap(lambda r: kabsch(seen[r], in_world[r], present[r]))(rows)
+
+    def squares(T: Array) -> Array:
+        moved = jnp.sum(lie.rotation(T) * seen[:, None], axis=-1) + lie.translation(T)
+        return jnp.sum((moved - in_world) ** 2, axis=-1)
+
+    extent = jnp.max(jnp.linalg.norm(in_world - in_world[:1], axis=-1))
+    extent = jnp.where(extent > 0, extent, 1)
+    scores, sizes = jax.vmap(lambda T: _log_evidence(squares(T), present, extent, d))(
+        tried
+    )
+    whole = jnp.all(usable[rows], axis=1)
+    first = jnp.argmax(jnp.where(whole, scores, -jnp.inf))
+    size = sizes[first]
+
+    def closer(_: Array, T: Array) -> Array:
+        w = jnp.exp(-squares(T) / (DEVIATIONS * size) ** 2 / 2)
+        return kabsch(seen, in_world, present * w)
+
+    return control.fori_loop(0, 5, closer, tried[first])
+
+
+def _log_evidence(
+    sq: Float[Array, " c"], present: Array, extent: Array, d: int
+) -> tuple[Array, Array]:
+    """The likeliest deviation of right points, and how likely.
+
+    A point is right or wrong with even odds, and lies anywhere in the extent if wrong.
+    A motion fits k / d points whatever they are, which are taken off.
+    """
+    deviation = extent * jnp.asarray(_LADDER, sq.dtype)
+    gain = d * jnp.log(extent / deviation)
+    each = jax.nn.softplus(gain[:, None] - sq / (2 * deviation[:, None] ** 2))
+    free = lie.tangent_dim(d) / d
+    total = jnp.sum(present * each, axis=1) - free * gain
+    best = jnp.argmax(total)
+    return total[best], deviation[best]
+
+
+def _choices(num: int, size: int) -> np.ndarray:
+    """Rows of points to fit, all choices if they are few; no key is needed."""
+    if math.comb(num, size) <= _CHOICES:
+        return np.array(list(itertools.combinations(range(num), size)))
+    draw = np.random.default_rng(0)
+    return np.stack([draw.choice(num, size, replace=False) for _ in range(_CHOICES)])
+
+
+def spans(in_world: Float[Array, "c d"], trust: Float[Array, " c"]) -> Bool[Array, ""]:
+    """Whether the trusted points hold every turn: they lie on no line, in 2D apart."""
+    w = jnp.where(trust > 0.5, 1.0, 0.0).astype(in_world.dtype)
+    mean = jnp.sum(w[:, None] * in_world, axis=0) / jnp.maximum(jnp.sum(w), 1)
+    off = (in_world - mean) * w[:, None]
+    spread = jnp.sum(off[:, :, None] * off[:, None, :], axis=0)
+    whole = jnp.trace(spread)
+    if in_world.shape[-1] == 2:
+        return whole > 0
+    # The sum of the minors: the products of two of the squared widths.
+    minors = (whole**2 - jnp.sum(spread**2)) / 2
+    return minors > 1e-6 * whole**2

@@ -1,0 +1,286 @@
+"""Priors, fixed poses and control points: the answer is in their frame."""
+
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from jaxreg import Status
+from jaxreg.averaging import (
+    Correntropy,
+    MotionAveraging,
+    PoseGraphLM,
+    average,
+    edge_report,
+    pose_covariances,
+)
+from jaxreg.geometry import lie
+from jaxreg.graph import PoseGraph
+from tests.averaging.graphs import motions, random_graph, rotations
+
+
+# Where a surveyor's coordinates lie: float32 rounds them to half a metre.
+MAP = np.array([350_000.0, 5_600_000.0, 120.0])
+
+
+def image(T: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return T[:-1, :-1] @ x + T[:-1, -1]
+
+
+def offset(T: np.ndarray, by: np.ndarray) -> np.ndarray:
+    out = np.array(T)
+    out[..., :-1, -1] += by
+    return out
+
+
+class Oracle:
+    """Least squares over the free poses, by SciPy in float64."""
+
+    def __init__(self, d: int, known: float = 7e3) -> None:
+        rng = np.random.default_rng(0)
+        self.num, self.fixed_frames = 7, [0, 4]
+        self.X, self.edges, self.T_i_j, _ = random_graph(7, 14, 0.0, 1, d=d, noise=6.0)
+        k = lie.tangent_dim(d)
+        half = rng.normal(size=(14, k, k))
+        self.information = 900 * (np.eye(k) + half @ half.swapaxes(1, 2) / k)
+        near = motions(rotations(rng, 2, d, 0.02), 0.02 * rng.normal(size=(2, d)))
+        self.priors = [
+            (int(i), self.X[i] @ E, np.diag(np.linspace(500.0, 900.0, k)))
+            for i, E in zip([2, 5], near, strict=True)
+        ]
+        self.fixed = [(i, self.X[i]) for i in self.fixed_frames]
+        seen = rng.normal(size=(4, d))
+        noise = 0.01 * rng.normal(size=(4, d))
+        self.control = [
+            (i, u, image(self.X[i], u) + e, known * np.diag(np.linspace(0.8, 1.2, d)))
+            for i, u, e in zip([1, 3, 3, 6], seen, noise, strict=True)
+        ]
+        self.graph = PoseGraph.from_edges(
+            self.edges, self.T_i_j, information=self.information
+        )
+
+    @property
+    def told(self) -> dict[str, Any]:
+        return {"priors": self.priors, "fixed": self.fixed, "control": self.control}
+
+    def rows(self, T: np.ndarray, trust: np.ndarray) -> np.ndarray:
+        inverse, i, j = np.linalg.inv, *self.edges.T
+        gaps = inverse(self.T_i_j) @ inverse(T[i]) @ T[j]
+        known = [inverse(M) @ T[k] for k, M, _ in self.priors]
+        errors = np.asarray(LOG(jnp.asarray(np.concatenate([gaps, known]))))
+        whole = [*self.information, *(W for *_, W in self.priors)]
+        out = [half(W).T @ e for W, e in zip(whole, errors, strict=True)]
+        for w, (k, u, q, W) in zip(trust, self.control, strict=True):
+            out.append(np.sqrt(w) * half(W).T @ (image(T[k], u) - q))
+        return np.concatenate(out)
+
+    def minimum(self, T: np.ndarray, trust: np.ndarray) -> Any:
+        free = [i for i in range(self.num) if i not in self.fixed_frames]
+        k = self.information.shape[-1]
+
+        def moved(x: np.ndarray) -> np.ndarray:
+            out = T.copy()
+            out[free] = T[free] @ np.asarray(EXP(jnp.asarray(x.reshape(-1, k))))
+            return out
+
+        start = np.zeros(k * len(free))
+        found = least_squares(
+            lambda x: self.rows(moved(x), trust), start, method="lm", xtol=1e-13
+        )
+        return found, free
+
+
+LOG, EXP, half = jax.jit(lie.log), jax.jit(lie.exp), np.linalg.cholesky
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_all_that_is_known_is_adjusted_at_once(d: int):
+    with jax.enable_x64(True):
+        case = Oracle(d)
+        sol = average(case.graph, PoseGraphLM(), **case.told)
+        T, trust = np.asarray(sol.T_world_i), np.asarray(sol.prior_weight)
+        assert sol.status == Status.CONVERGED
+        assert bool(jnp.all(sol.placed))
+        np.testing.assert_allclose(T[[0, 4]], case.X[[0, 4]], atol=1e-14)
+        np.testing.assert_array_equal(trust[:2], 1)
+        found, free = case.minimum(T, trust[2:])
+        np.testing.assert_allclose(found.x, 0, atol=1e-5)
+
+        report = edge_report(case.graph, sol, **case.told)
+        k = 6 if d == 3 else 3
+        between = np.isin(case.edges, case.fixed_frames).all(axis=1).sum()
+        rows = k * (14 - between) + k * 2 + d * 4
+        assert report.degrees_of_freedom == rows - k * 5
+        ranks = np.repeat([k, d], [16, 4])
+        assert (report.redundancy * ranks)[report.trusted].sum() == pytest.approx(
+            report.degrees_of_freedom
+        )
+        assert report.trusted.sum() == 20 - between
+        errors = case.rows(T, np.ones(4)).reshape(-1)
+        square = np.sum(errors**2) - np.sum(
+            errors[: 14 * k].reshape(14, k)[~report.trusted[:14]] ** 2
+        )
+        assert report.chi_square == pytest.approx(square, rel=1e-6)
+        assert report.edges[14:].tolist() == [[-1, i] for i in (2, 5, 1, 3, 3, 6)]
+
+        wanted = np.linalg.inv(found.jac.T @ found.jac)
+        covariances = np.asarray(pose_covariances(case.graph, sol, **case.told))
+        np.testing.assert_array_equal(covariances[[0, 4]], 0)
+        for n, i in enumerate(free):
+            own = wanted[k * n : k * (n + 1), k * n : k * (n + 1)]
+            np.testing.assert_allclose(
+                covariances[i], own, atol=0.02 * np.abs(own).max()
+            )
+        with pytest.raises(ValueError, match="6 priors and control points"):
+            edge_report(case.graph, sol)
+
+
+@pytest.fixture(scope="module")
+def survey() -> tuple[np.ndarray, PoseGraph]:
+    """Poses on a map, and a graph in float32 of which a fifth is wrong."""
+    X, edges, T_i_j, _ = random_graph(20, 100, 0.2, 3)
+    X[:, :3, 3] *= 40
+    T_i_j[:, :3, 3] *= 40
+    graph = PoseGraph.from_edges(edges, T_i_j.astype(np.float32))
+    return offset(X, MAP), graph
+
+
+def off(sol: Any, X: np.ndarray) -> float:
+    assert isinstance(sol.T_world_i, np.ndarray)
+    assert sol.T_world_i.dtype == np.float64
+    return float(np.linalg.norm((sol.T_world_i - X)[:, :3, 3], axis=1).max())
+
+
+def test_wrong_priors_are_told_and_a_fixed_pose_stays(
+    survey: tuple[np.ndarray, PoseGraph],
+):
+    X, graph = survey
+    rng = np.random.default_rng(0)
+    frames, wrong = rng.choice(20, 8, replace=False), [1, 4, 6]
+    priors = [(int(i), X[i]) for i in frames]
+    for n in wrong:
+        shift = rng.normal(size=3)
+        shift *= 10 / np.linalg.norm(shift)
+        priors[n] = (priors[n][0], offset(priors[n][1], shift))
+    sol = average(graph, Correntropy(), priors=priors)
+    assert sol.status == Status.CONVERGED
+    assert np.flatnonzero(np.asarray(sol.prior_weight) < 0.5).tolist() == wrong
+    assert off(sol, X) < 0.5
+    held = int(frames[1])
+    sol = average(graph, Correntropy(), priors=priors, fixed=[(held, X[held])])
+    np.testing.assert_allclose(sol.T_world_i[held], X[held], atol=1e-5)
+    assert off(sol, X) < 0.5
+    assert np.asarray(sol.prior_weight)[1] == 0
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_almost_half_of_the_control_points_may_be_wrong(
+    survey: tuple[np.ndarray, PoseGraph], told: bool
+):
+    X, graph = survey
+    rng = np.random.default_rng(1)
+    frames, wrong = rng.choice(20, 9, replace=False), [0, 3, 5, 8]
+    seen = 3 * rng.normal(size=(9, 3))
+    lies = np.stack([image(X[i], u) for i, u in zip(frames, seen, strict=True)])
+    lies += 0.01 * rng.normal(size=(9, 3))
+    lies[wrong] += 8 * rng.normal(size=(4, 3))
+    known = [(1e4 * np.eye(3),) if told else ()] * 9
+    control = [
+        (int(i), u, q, *W) for i, u, q, W in zip(frames, seen, lies, known, strict=True)
+    ]
+    sol = average(graph, Correntropy(), control=control)
+    assert sol.status == Status.CONVERGED
+    assert np.flatnonzero(np.asarray(sol.prior_weight) < 0.5).tolist() == wrong
+    assert off(sol, X) < 0.5
+
+
+def test_points_on_a_line_leave_a_turn_free():
+    X, edges, T_i_j, _ = random_graph(7, 14, 0.0, 1)
+    graph = PoseGraph.from_edges(edges, T_i_j.astype(np.float32))
+    line = [(i, np.zeros(3), np.array([i, 2.0 * i, 0])) for i in range(5)]
+    sol = average(graph, PoseGraphLM(), control=line)
+    assert sol.status == Status.DEGENERATE
+
+
+def test_parts_of_a_graph_meet_in_the_world():
+    X, edges, T_i_j, _ = random_graph(8, 20, 0.0, 2)
+    apart = (edges < 4).all(axis=1) | (edges >= 4).all(axis=1)
+    graph = PoseGraph.from_edges(edges[apart], T_i_j[apart].astype(np.float32))
+    sol = average(graph, PoseGraphLM(), priors=[(2, X[2]), (6, X[6])])
+    assert bool(jnp.all(sol.placed))
+    np.testing.assert_allclose(sol.T_world_i, X, atol=0.05)
+    sol = average(graph, PoseGraphLM(), priors=[(6, X[6])])
+    assert sol.status == Status.DISCONNECTED
+    assert np.flatnonzero(np.asarray(sol.placed)).tolist() == [4, 5, 6, 7]
+    assert np.asarray(sol.component).tolist() == [0, 0, 0, 0, 4, 4, 4, 4]
+
+
+def test_poses_follow_what_is_known():
+    with jax.enable_x64(True):
+        # So little is known that trust, which is held, is near one.
+        case = Oracle(2, known=50.0)
+        u, q = (jnp.asarray(case.control[0][n]) for n in (1, 2))
+
+        @jax.jit
+        def y_of_pose(move: jax.Array, shift: jax.Array) -> jax.Array:
+            frame, T, W = case.priors[0]
+            T = jnp.asarray(T).at[:2, 2].add(move)
+            sol = average(
+                case.graph,
+                PoseGraphLM(tolerance=1e-12),
+                priors=[(frame, T, W), case.priors[1]],
+                fixed=case.fixed,
+                control=[(1, u, q + shift, case.control[0][3]), *case.control[1:]],
+            )
+            return sol.T_world_i[1, 1, 2]
+
+        zero, step = jnp.zeros(2), 1e-4
+        by_prior, by_point = jax.jit(jax.grad(y_of_pose, (0, 1)))(zero, zero)
+        for n, axis in enumerate(step * jnp.eye(2)):
+            change = y_of_pose(axis, zero) - y_of_pose(-axis, zero)
+            assert float(by_prior[n]) == pytest.approx(
+                float(change) / (2 * step), abs=2e-3
+            )
+            change = y_of_pose(zero, axis) - y_of_pose(zero, -axis)
+            assert float(by_point[n]) == pytest.approx(
+                float(change) / (2 * step), abs=2e-3
+            )
+        assert float(by_point[1]) > 0.01
+
+
+EYE, ZERO = np.eye(4), np.zeros(3)
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ({"priors": [(0, EYE), (9, EYE)]}, "priors[1]: wanted a frame below 7"),
+        ({"priors": [(0, 2 * EYE)]}, "priors[0]: wanted rigid motions"),
+        ({"priors": [(0, ZERO)]}, "priors[0]: wanted shape (4, 4)"),
+        (
+            {"priors": [(0, EYE, np.diag([1.0, 1, 1, 0, 0, 0]))]},
+            "priors[0]: information: wanted a positive definite matrix",
+        ),
+        ({"priors": [(0,)]}, "priors[0]: wanted (frame, T_world_i)"),
+        ({"fixed": [(1, EYE), (1, EYE)]}, "fixed[1]: frame 1 is fixed by fixed[0]"),
+        ({"fixed": [(1.0, EYE)]}, "fixed[0]: wanted a frame's number"),
+        ({"control": [(0, ZERO, ZERO)]}, "control: wanted at least 3 points"),
+        ({"control": [(0, ZERO)]}, "control[0]: wanted (frame, point in it"),
+        (
+            {"control": [(0, ZERO, ZERO, np.eye(3)), *[(0, ZERO, ZERO)] * 2]},
+            "control[1]: wanted an information, as control[0] has one",
+        ),
+    ],
+)
+def test_wrong_rows_are_named(told: dict[str, Any], message: str):
+    _, edges, T_i_j, _ = random_graph(7, 14, 0.0, 1)
+    info = np.broadcast_to(np.eye(6), (14, 6, 6))
+    graph = PoseGraph.from_edges(edges, T_i_j, information=info)
+    with pytest.raises((ValueError, TypeError), match=re.escape(message)):
+        average(graph, MotionAveraging(), **told)
+    with pytest.raises(ValueError, match="of one graph"):
+        average([graph], **told)
