@@ -121,6 +121,7 @@ def edge_report(
         usable = np.asarray(graph.mask) & (np.asarray(graph.weight) > 0) & sound
         trusted = given & usable
         share = jnp.asarray(trusted, jnp.float64)
+        held = np.unique(np.append(np.asarray(graph.edges)[trusted], 0))
         noise = deviations(wide, T, share)
         Omega = precisions(wide, jnp.ones_like(share), noise)
         if wide.information is None:
@@ -131,9 +132,8 @@ def edge_report(
         redundancy = np.full(len(r), np.nan)
         if graph.num_poses * k <= max_unknowns:
             W = jnp.where(trusted[:, None, None], Omega, 0)
-            redundancy = np.where(trusted, _redundancy(wide, T, W, ranks), 1.0)
+            redundancy = np.where(trusted, _redundancy(wide, T, W, ranks, held), 1.0)
     square = np.einsum("ea,eab,eb->e", r, weights, r)
-    held = np.unique(np.append(np.asarray(graph.edges)[trusted], 0))
     spare = int(ranks[trusted].sum()) - k * (len(held) - 1)
     total = float(square[trusted].sum())
     normalised = np.sqrt(square / np.maximum(ranks, 1))
@@ -164,12 +164,15 @@ def _ranks(Omega: np.ndarray) -> np.ndarray:
 
 
 def _redundancy(
-    graph: PoseGraph, T: jax.Array, W: jax.Array, ranks: np.ndarray
+    graph: PoseGraph, T: jax.Array, W: jax.Array, ranks: np.ndarray, held: np.ndarray
 ) -> np.ndarray:
-    """`(e,)` 1 less the mean of W A inv(A' W A) A' over each edge's components A."""
+    """`(e,)` 1 less the mean of W A inv(A' W A) A' over each edge's components A.
+
+    `held` are the frames that trusted edges hold, and the others no unknowns.
+    """
     num, k = graph.num_poses, W.shape[-1]
     H = np.array(normal_equations(graph, T, W)[0])
-    idle = np.diagonal(H) == 0  # of frames without edges
+    idle = np.setdiff1d(np.arange(num), held)[:, None] * k + np.arange(k)
     H[idle, idle] = 1
     try:
         C = np.linalg.inv(H).reshape(num, k, num, k).swapaxes(1, 2)
