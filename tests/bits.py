@@ -107,7 +107,7 @@ def _child(names: list[str], cores: int, load: bool, folder: str) -> None:
     for name in names:
         leaves = jax.tree_util.tree_leaves_with_path(FUNCTIONS[name]())
         arrays = {jax.tree_util.keystr(path): np.asarray(x) for path, x in leaves}
-        np.savez(Path(folder) / name, **arrays)
+        np.savez(Path(folder) / name, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 def _busy() -> None:

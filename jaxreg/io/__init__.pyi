@@ -4,8 +4,10 @@ from .atomic import require_writable as require_writable
 from .errors import InputError as InputError
 from .errors import MissingExtraError as MissingExtraError
 from .graphs.g2o import read_g2o as read_g2o
+from .graphs.g2o import read_g2o_known as read_g2o_known
 from .graphs.g2o import read_g2o_poses as read_g2o_poses
 from .graphs.g2o import write_g2o as write_g2o
+from .graphs.g2o_known import KnownOfGraph as KnownOfGraph
 from .graphs.redwood import read_info as read_info
 from .graphs.redwood import read_log as read_log
 from .graphs.redwood import write_log as write_log

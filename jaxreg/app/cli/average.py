@@ -1,5 +1,6 @@
 """`jaxreg average`: poses from the relative motions of a g2o file."""
 
+import dataclasses
 import warnings
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,12 @@ from rich.table import Table
 from jaxreg._core.status import Status
 from jaxreg.app.advice import terminal_advice
 from jaxreg.app.cli import outputs
+from jaxreg.app.cli.known import is_told, known_entries, read_known, show_known
 from jaxreg.app.cli.options import Average
 from jaxreg.app.cli.runtime import Session, key_of
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_graph, save_figure, write_graph_report
+from jaxreg.app.plot.results import MAX_COVARIANCES
 from jaxreg.app.result import RESULT_FORMAT, write_json
 from jaxreg.app.versions import versions
 from jaxreg.averaging import (
@@ -26,13 +29,15 @@ from jaxreg.averaging import (
     WeightedMotionAveraging,
     average,
     edge_report,
+    pose_covariances,
 )
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.io.errors import InputError
 from jaxreg.io.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
+from jaxreg.io.graphs.g2o_known import KnownOfGraph
 from jaxreg.io.graphs.redwood import read_log
 from jaxreg.io.poses.tum import write_tum
-from jaxreg.metrics import chordal_objective
+from jaxreg.metrics import align_poses, chordal_objective
 
 
 METHODS = {
@@ -52,6 +57,7 @@ def run(command: Average, session: Session) -> int:
     with session.timed("read"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         graph, ids = _read(command.graph)
+        known = read_known(command, ids, graph.dim)
     for message in {str(w.message) for w in caught}:
         session.console.print(message)
     key = key_of(command)
@@ -59,13 +65,17 @@ def run(command: Average, session: Session) -> int:
         progress("averaging", 0, 2)
         before = average(graph, method=ShortestPaths())
         progress("averaging", 1, 2)
-        sol = average(graph, method=method, key=key)
+        sol = average(graph, method=method, key=key, **known._asdict())
         jax.block_until_ready(sol)
         progress("averaging", 2, 2)
+    if is_told(known):
+        before = _beside(before, sol)
     objective = [float(chordal_objective(graph, s.T_world_i)) for s in (before, sol)]
-    report = edge_report(graph, sol)
-    _write(session, graph, before, sol, ids, objective, report)
+    report = edge_report(graph, sol, **known._asdict())
+    entries = known_entries(known, sol, report, ids)
+    _write(session, graph, before, sol, ids, objective, report, known, entries)
     _show(session, graph, sol, objective)
+    show_known(session, entries, len(known.fixed))
     _show_residuals(session, report, ids)
     outputs.show_end(session, FILES, command.out)
     return 0
@@ -80,6 +90,13 @@ def _read(path: Path) -> tuple[PoseGraph, np.ndarray]:
     return read_g2o(path), ids
 
 
+def _beside(before: AveragingSolution, sol: AveragingSolution) -> AveragingSolution:
+    """Poses to compare with, moved to those of the answer as one body."""
+    poses = before.T_world_i, sol.T_world_i
+    T = align_poses(*poses, align="best", mask=sol.placed & before.placed)
+    return dataclasses.replace(before, T_world_i=T)
+
+
 def _write(
     session: Session,
     graph: PoseGraph,
@@ -88,6 +105,8 @@ def _write(
     ids: np.ndarray,
     objective: list[float],
     report: EdgeReport,
+    known: KnownOfGraph,
+    entries: list[dict[str, Any]],
 ) -> None:
     with result_folder(session.options.out) as staging:
         with session.timed("write"):
@@ -98,7 +117,7 @@ def _write(
                 np.asarray(sol.placed),
             )
             save_figure(staging / "figure.png", figure)
-            write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids)
+            write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids, known)
             placed = np.asarray(sol.placed)
             write_tum(
                 staging / "poses.tum",
@@ -106,6 +125,9 @@ def _write(
                 timestamps=ids[placed],
             )
         document = _document(sol, ids, objective) | _adjusted(graph, sol, ids, report)
+        if is_told(known):
+            document["fixed"] = [int(ids[frame]) for frame, _ in known.fixed]
+            document["known"] = entries
         document |= {
             "command": session.command,
             "seed": session.options.seed,
@@ -121,9 +143,17 @@ def _write(
                 sol,
                 before,
                 ids.tolist(),
+                covariances=_covariances(graph, sol, known),
                 details=outputs.page_details(session, document)
                 | {k: document[k] for k in ("objective_before", "objective_after")},
             )
+
+
+def _covariances(graph: PoseGraph, sol: AveragingSolution, known: KnownOfGraph) -> Any:
+    """For the page; None where the graph is too large for them."""
+    if graph.num_poses > MAX_COVARIANCES:
+        return None
+    return pose_covariances(graph, sol, **known._asdict())
 
 
 def _adjusted(
@@ -202,7 +232,11 @@ def _show_residuals(session: Session, report: EdgeReport, ids: np.ndarray) -> No
     for row in report.worst:
         i, j = report.edges[row]
         table.add_row(
-            *(str(ids[i]), str(ids[j]), f"{report.translation[row]:.4g}"),
+            *(
+                "world" if i < 0 else str(ids[i]),
+                str(ids[j]),
+                f"{report.translation[row]:.4g}",
+            ),
             f"{np.rad2deg(report.rotation[row]):.4g}",
             f"{report.normalised[row]:.2f}",
             f"{report.redundancy[row]:.2f}",

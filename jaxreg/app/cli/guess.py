@@ -12,7 +12,9 @@ from jaxreg.io.files import reading, require_regular
 from jaxreg.io.rows import read_lines
 
 
-def read_guess(text: str, names: tuple[str, str], dim: int, scaled: bool) -> np.ndarray:
+def read_guess(
+    text: str, names: tuple[str, str], dim: int, scaled: bool, of: str = "--init"
+) -> np.ndarray:
     """`T_target_source`, `(d+1, d+1)` float64, between the frames of the files.
 
     Args:
@@ -21,6 +23,7 @@ def read_guess(text: str, names: tuple[str, str], dim: int, scaled: bool) -> np.
         names: of target and source, by which a result.json of many scans is asked.
         dim: of the scans.
         scaled: whether its rotation may be times a factor.
+        of: the option that it belongs to.
 
     Raises:
         InputError: if there is no such file, or it holds no such motion.
@@ -28,9 +31,9 @@ def read_guess(text: str, names: tuple[str, str], dim: int, scaled: bool) -> np.
     words = text.replace(",", " ").split()
     try:
         found = np.array(words, dtype=np.float64)
-        place = "--init"
+        place = of
     except ValueError:
-        found, place = _of_file(Path(text), names), f"--init {text}"
+        found, place = _of_file(Path(text), names), f"{of} {text}"
     wanted = {dim * (dim + 1), (dim + 1) ** 2}
     if found.size not in wanted or not np.isfinite(found).all():
         raise InputError(

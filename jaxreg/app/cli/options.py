@@ -198,6 +198,16 @@ class Average(Options):
         ),
     ] = None
     """Steps of the method, at most."""
+    control: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
+    ] = None
+    """Surveyed points, rows of: frame, [point in it,] point in the world [, sigma]."""
+    fix: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="FRAME=POSE ...", help_behavior_hint="(default: none)"),
+    ] = ()
+    """Poses that stay: a file of one matrix, or its numbers in quotes."""
 
 
 @dataclass(frozen=True)

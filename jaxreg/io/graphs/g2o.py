@@ -5,7 +5,6 @@ information of the right tangent error (translation first). As GTSAM and SE-Sync
 the rotational part is taken to be that of the rotation vector.
 """
 
-import collections
 import gzip
 import warnings
 from pathlib import Path
@@ -22,28 +21,22 @@ from jaxreg.graph.edge_checks import EdgeError, check_information, check_weights
 from jaxreg.graph.pose_graph import PoseGraph, check_graph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
-from jaxreg.io.files import text_lines
+from jaxreg.io.graphs.g2o_known import KINDS as KNOWN
+from jaxreg.io.graphs.g2o_known import KnownOfGraph, known_lines, known_of
+from jaxreg.io.graphs.g2o_lines import Lines, Rows, columns, lines_of, motions
 from jaxreg.io.graphs.information import nearest_semidefinite
-from jaxreg.io.quaternions import motions_from_xyzw, xyzw_from_rotations
 
 
 _VERTEX = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
 _EDGE = {"EDGE_SE2": 9, "EDGE_SE3:QUAT": 28}
-KINDS = (*_VERTEX, *_EDGE, "FIX")
-
-
-class _Rows(NamedTuple):
-    """Lines of one kind: their numbers in the file, ids and values."""
-
-    line: np.ndarray
-    ids: np.ndarray
-    values: np.ndarray
+KINDS = (*_VERTEX, *_EDGE, *KNOWN, "FIX")
 
 
 class _File(NamedTuple):
+    lines: Lines
     ids: np.ndarray
-    vertices: _Rows
-    edges: _Rows
+    vertices: Rows
+    edges: Rows
     dim: int
 
 
@@ -55,8 +48,8 @@ def read_g2o(path: str | Path) -> PoseGraph:
 
     Returns:
         The graph, with information matrices. Its frames are the ids of the file in
-        increasing order, see `read_g2o_poses`; FIX lines are not needed, as frame 0 is
-        the one that stays. Lines of unknown kinds are skipped, and for indefinite
+        increasing order, see `read_g2o_poses`; what the file knows of poses is read by
+        `read_g2o_known`. Lines of unknown kinds are skipped, and for indefinite
         information matrices the nearest positive semidefinite ones are taken; a
         warning counts either.
 
@@ -70,7 +63,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
     d = file.dim
     k = lie.tangent_dim(d)
     num = d + 1 if d == 2 else 7
-    T_i_j = _motions(file.edges, d, path)
+    T_i_j = motions(file.edges, d, path)
     upper = file.edges.values[:, num:]
     information = np.zeros((len(upper), k, k))
     rows, columns = np.triu_indices(k)
@@ -101,7 +94,7 @@ def read_g2o_poses(
         InputError: as `read_g2o`.
     """
     file = _parse(Path(path))
-    T = _motions(file.vertices, file.dim, path)
+    T = motions(file.vertices, file.dim, path)
     where = np.searchsorted(file.ids, file.vertices.ids[:, 0])
     if len(np.unique(where)) != len(where):
         raise InputError(f"{path}: a vertex id occurs twice.")
@@ -112,11 +105,28 @@ def read_g2o_poses(
     return file.ids, jnp.asarray(poses, dtype=jnp.result_type(float))
 
 
+def read_g2o_known(path: str | Path) -> KnownOfGraph:
+    """Reads what a g2o file knows of poses.
+
+    Returns:
+        Lists that `average` takes as they are, `average(graph, **known._asdict())`:
+        priors (EDGE_PRIOR_SE2, EDGE_SE3_PRIOR), fixed poses (FIX, of vertices that have
+        a pose), control points (EDGE_PRIOR_SE2_XY, EDGE_SE3_XYZPRIOR, and priors that
+        say nothing of turns). Frames as in `read_g2o`.
+
+    Raises:
+        InputError: as `read_g2o`; for ids and parameters that the file does not have.
+    """
+    file = _parse(Path(path))
+    return known_of(file.lines, file.ids, file.vertices, file.dim)
+
+
 def write_g2o(
     path: str | Path,
     graph: PoseGraph,
     T_world_i: ArrayLike | None = None,
     ids: ArrayLike | None = None,
+    known: KnownOfGraph | None = None,
 ) -> None:
     """Writes poses and edges; the file appears whole or not at all.
 
@@ -128,6 +138,8 @@ def write_g2o(
         graph: the relative motions.
         T_world_i: `(v, d+1, d+1)` poses, or None for no VERTEX lines.
         ids: `(v,)` names of the frames, None for 0, 1, 2, ...
+        known: what `read_g2o_known` reads again; fixed poses are those of `T_world_i`,
+            and an information that is left out is the identity.
 
     Raises:
         ValueError: if `T_world_i` or `ids` do not belong to the graph, or it holds what
@@ -155,7 +167,7 @@ def write_g2o(
                 f"T_world_i: wanted shape {(num, d + 1, d + 1)}, found {poses.shape}."
             )
         check_rigid(poses, "T_world_i")
-        lines += _lines(list(_VERTEX)[d - 2], names[:, None], _columns(poses), digits)
+        lines += lines_of(list(_VERTEX)[d - 2], names[:, None], columns(poses), digits)
     keep = np.asarray(graph.mask)
     k = lie.tangent_dim(d)
     weight = np.asarray(graph.weight, dtype=np.float64)[keep, None, None]
@@ -165,38 +177,22 @@ def write_g2o(
     upper = (weight * info)[:, *np.triu_indices(k)]
     T_i_j = np.asarray(graph.T_i_j, dtype=np.float64)[keep]
     check_rigid(T_i_j, "graph: T_i_j")
-    motions = _columns(T_i_j)
+    motions = columns(T_i_j)
     values = np.concatenate([motions, upper], axis=1)
-    lines += _lines(
+    lines += lines_of(
         list(_EDGE)[d - 2], names[np.asarray(graph.edges)[keep]], values, digits
     )
+    if known is not None:
+        lines += known_lines(known, names, d, digits)
     text = "\n".join(lines) + "\n"
     with atomic_write(path, "wb") as file:
         data = text.encode()
         file.write(gzip.compress(data) if Path(path).suffix == ".gz" else data)
 
 
-def _columns(T: np.ndarray) -> np.ndarray:
-    if T.shape[-1] == 3:
-        angle = np.arctan2(T[:, 1, 0], T[:, 0, 0])
-        return np.concatenate([T[:, :2, 2], angle[:, None]], axis=1)
-    return np.concatenate([T[:, :3, 3], xyzw_from_rotations(T[:, :3, :3])], axis=1)
-
-
-def _lines(tag: str, ids: np.ndarray, values: np.ndarray, digits: int) -> list[str]:
-    form = " ".join([f"%.{digits}g"] * values.shape[1])
-    return [
-        f"{tag} {' '.join(map(str, name))} {form % tuple(row)}"
-        for name, row in zip(ids.tolist(), values.tolist(), strict=True)
-    ]
-
-
 def _parse(path: Path) -> _File:
-    found: dict[str, list[tuple[int, list[str]]]] = collections.defaultdict(list)
-    for number, line in text_lines(path):
-        words = line.split()
-        if words and not words[0].startswith("#"):
-            found[words[0]].append((number, words[1:]))
+    lines = Lines(path)
+    found = lines.found
     dims = [d for d in (2, 3) if any(f"SE{d}" in tag for tag in found)]
     if len(dims) != 1:
         what = "2D and 3D lines in one file" if dims else "no SE2 or SE3 line"
@@ -212,61 +208,7 @@ def _parse(path: Path) -> _File:
         )
     d = dims[0]
     vertex, edge = list(_VERTEX)[d - 2], list(_EDGE)[d - 2]
-    vertices = _rows(path, vertex, found[vertex], 1, _VERTEX[vertex])
-    edges = _rows(path, edge, found[edge], 2, _EDGE[edge])
+    vertices = lines.rows(vertex, 1, _VERTEX[vertex])
+    edges = lines.rows(edge, 2, _EDGE[edge])
     ids = np.unique(np.concatenate([vertices.ids.ravel(), edges.ids.ravel()]))
-    return _File(ids, vertices, edges, d)
-
-
-def _rows(
-    path: Path, tag: str, rows: list[tuple[int, list[str]]], num_ids: int, num: int
-) -> _Rows:
-    for number, words in rows:
-        if len(words) != num_ids + num:
-            raise InputError(
-                f"{path}, line {number}: {tag} wants {num_ids + num} numbers, "
-                f"found {len(words)}. Is the file cut off?"
-            )
-    lines = np.array([number for number, _ in rows], dtype=np.int64)
-    try:
-        ids = np.array([words[:num_ids] for _, words in rows], dtype=np.int64)
-        values = np.array([words[num_ids:] for _, words in rows], dtype=np.float64)
-    except (ValueError, OverflowError):
-        raise _first_bad_number(path, rows, num_ids) from None
-    values = values.reshape(-1, num)
-    bad = ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        raise InputError(
-            f"{path}, line {lines[np.argmax(bad)]}: {tag} holds a number that is not "
-            "finite."
-        )
-    return _Rows(lines, ids.reshape(-1, num_ids), values)
-
-
-def _first_bad_number(
-    path: Path, rows: list[tuple[int, list[str]]], num_ids: int
-) -> InputError:
-    for number, words in rows:
-        for at, word in enumerate(words):
-            try:
-                int(word) if at < num_ids else float(word)
-            except ValueError:
-                kind = "an integer id" if at < num_ids else "a number"
-                return InputError(f"{path}, line {number}: {word!r} is not {kind}.")
-    return InputError(f"{path}: an id does not fit into 64 bits.")
-
-
-def _motions(rows: _Rows, d: int, path: str | Path) -> np.ndarray:
-    values = rows.values
-    if d == 3:
-        short = np.linalg.norm(values[:, 3:7], axis=1) < 1e-6
-        if short.any():
-            raise InputError(
-                f"{path}, line {rows.line[np.argmax(short)]}: the quaternion is zero."
-            )
-        return motions_from_xyzw(values[:, :3], values[:, 3:7])
-    T = np.tile(np.eye(3), (len(values), 1, 1))
-    c, s = np.cos(values[:, 2]), np.sin(values[:, 2])
-    T[:, :2, :2] = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
-    T[:, :2, 2] = values[:, :2]
-    return T
+    return _File(lines, ids, vertices, edges, d)

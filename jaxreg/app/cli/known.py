@@ -1,0 +1,137 @@
+"""What is known of a graph's poses: lines of its file, `--control` and `--fix`."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from jaxreg.app.cli.guess import read_guess
+from jaxreg.app.cli.options import Average
+from jaxreg.app.cli.runtime import Session
+from jaxreg.averaging import AveragingSolution, EdgeReport
+from jaxreg.io.errors import InputError
+from jaxreg.io.files import text_lines
+from jaxreg.io.graphs.g2o import read_g2o_known
+from jaxreg.io.graphs.g2o_known import KnownOfGraph
+
+
+def read_known(command: Average, ids: np.ndarray, d: int) -> KnownOfGraph:
+    """All that is known; a pose of `--fix` takes the place of the file's."""
+    known = KnownOfGraph([], [], [])
+    if command.graph.suffix.lower() != ".log":
+        known = read_g2o_known(command.graph)
+    fixed = dict(known.fixed)
+    for words in command.fix:
+        name, _, pose = words.partition("=")
+        if not pose:
+            raise InputError(f"--fix {words}: wanted FRAME=POSE.")
+        frame = _frame(name, ids, f"--fix {words}")
+        fixed[frame] = read_guess(pose, ("", name), d, scaled=False, of="--fix")
+    control = known.control
+    if command.control is not None:
+        control = control + _read_control(command.control, ids, d)
+    told = KnownOfGraph(known.priors, list(fixed.items()), control)
+    if control and not (known.priors or fixed) and len(control) < d:
+        raise InputError(
+            f"--control: wanted at least {d} points, or a fixed pose, found "
+            f"{len(control)}."
+        )
+    return told
+
+
+def _frame(word: str, ids: np.ndarray, place: str) -> int:
+    found = np.flatnonzero(ids.astype(str) == word.strip())
+    if not len(found):
+        raise InputError(
+            f"{place}: no frame {word.strip()!r}; the first are "
+            f"{', '.join(map(str, ids[:5]))}."
+        )
+    return int(found[0])
+
+
+def _read_control(path: Path, ids: np.ndarray, d: int) -> list[tuple[Any, ...]]:
+    """Rows of a table: a frame, a point in it or nothing, where it lies, a deviation.
+
+    Words in the first row are the names of the columns.
+    """
+    out, told = [], None
+    for n, (line, text) in enumerate(text_lines(path)):
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        frame, *words = next(csv.reader([text.replace(";", ",").replace("\t", ",")]))
+        place = f"{path}, line {line}"
+        try:
+            numbers = np.array(words, np.float64)
+        except ValueError:
+            if n == 0:
+                continue
+            raise InputError(f"{place}: not numbers after the frame: {text}") from None
+        deviation = len(numbers) in (d + 1, 2 * d + 1)
+        if len(numbers) not in (d, d + 1, 2 * d, 2 * d + 1):
+            raise InputError(
+                f"{place}: wanted a frame, {d} coordinates in the world, or {d} in the "
+                f"frame and {d} in the world, and a standard deviation if it is known; "
+                f"found {len(numbers)} numbers."
+            )
+        if told not in (None, deviation):
+            raise InputError(f"{place}: a standard deviation in some rows, not in all.")
+        told = deviation
+        if not np.isfinite(numbers).all() or (deviation and numbers[-1] <= 0):
+            raise InputError(f"{place}: wanted finite numbers, deviations above zero.")
+        *places, sigma = numbers if deviation else np.append(numbers, 0)
+        seen = places[:d] if len(places) == 2 * d else np.zeros(d)
+        row = (_frame(frame, ids, place), np.array(seen), np.array(places[-d:]))
+        out.append((*row, np.eye(d) / sigma**2) if deviation else row)
+    if not out:
+        raise InputError(f"{path}: holds no control points.")
+    return out
+
+
+def is_told(known: KnownOfGraph) -> bool:
+    """Whether anything is known."""
+    return any(known)
+
+
+def known_entries(
+    known: KnownOfGraph, sol: AveragingSolution, report: EdgeReport, ids: np.ndarray
+) -> list[dict[str, Any]]:
+    """How far each prior and control point is off, and its trust, for result.json."""
+    if sol.prior_weight is None:
+        return []
+    kinds = ["prior"] * len(known.priors) + ["control"] * len(known.control)
+    frames = [row[0] for row in known.priors + known.control]
+    first = len(report.edges) - len(kinds)
+    weights = np.asarray(sol.prior_weight)
+    return [
+        {
+            "kind": kind,
+            "frame": int(ids[frame]),
+            "weight": float(weights[n]),
+            "translation": float(report.translation[first + n]),
+            "normalised_residual": float(report.normalised[first + n]),
+        }
+        for n, (kind, frame) in enumerate(zip(kinds, frames, strict=True))
+    ]
+
+
+def show_known(session: Session, entries: list[dict[str, Any]], num_fixed: int) -> None:
+    """What became of priors and control points; those that are not trusted by name."""
+    if num_fixed:
+        session.console.print(f"Poses held as they were given: {num_fixed}.")
+    if not entries:
+        return
+    table = Table(title="Priors and control points")
+    for name in ("", "frame", "off", "normalised", "trusted"):
+        table.add_column(name, justify="right")
+    order = sorted(entries, key=lambda x: (x["weight"] > 0.5, -x["translation"]))
+    for entry in order[:20]:
+        table.add_row(
+            entry["kind"],
+            str(entry["frame"]),
+            f"{entry['translation']:.4g}",
+            f"{entry['normalised_residual']:.2f}",
+            "yes" if entry["weight"] > 0.5 else "no",
+        )
+    session.console.print(table)
