@@ -12,7 +12,13 @@ from rich.table import Table
 from jaxreg._core.status import Status
 from jaxreg.app.advice import terminal_advice
 from jaxreg.app.cli import outputs
-from jaxreg.app.cli.known import is_told, known_entries, read_known, show_known
+from jaxreg.app.cli.known import (
+    is_told,
+    known_entries,
+    read_known,
+    show_known,
+    writable,
+)
 from jaxreg.app.cli.options import Average
 from jaxreg.app.cli.runtime import Session, key_of
 from jaxreg.app.folder import result_folder
@@ -117,7 +123,8 @@ def _write(
                 np.asarray(sol.placed),
             )
             save_figure(staging / "figure.png", figure)
-            write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids, known)
+            kept = writable(session, known, graph.dim)
+            write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids, kept)
             placed = np.asarray(sol.placed)
             write_tum(
                 staging / "poses.tum",

@@ -94,6 +94,20 @@ def is_told(known: KnownOfGraph) -> bool:
     return any(known)
 
 
+def writable(session: Session, known: KnownOfGraph, d: int) -> KnownOfGraph:
+    """What graph.g2o can hold; the points that it cannot are counted."""
+    control = [
+        row for row in known.control if len(row) > 3 and (d == 3 or not row[1].any())
+    ]
+    missing = len(known.control) - len(control)
+    if missing:
+        session.console.print(
+            f"graph.g2o lacks {missing} control points: of no known deviation, or in "
+            "2D beside the origin of their frame."
+        )
+    return known._replace(control=control)
+
+
 def known_entries(
     known: KnownOfGraph, sol: AveragingSolution, report: EdgeReport, ids: np.ndarray
 ) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ import pytest
 
 from jaxreg.app.cli.main import main
 from jaxreg.io import write_ply
-from tests.app.cli.stand_ins import CLOUD, left, save_scans
+from tests.app.cli.stand_ins import CLOUD, GRAPH, left, save_scans
 
 
 def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
@@ -24,6 +24,8 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
     np.savez(folder / "one.npz", alone=CLOUD)
     np.savez(folder / "three.npz", a=CLOUD, b=CLOUD, c=CLOUD)
     (folder / "hollow").mkdir()
+    (folder / "g.g2o").write_text(GRAPH)
+    (folder / "p.csv").write_text("frame,x,y\n0,1\n")
     (folder / "bad.g2o").write_text("EDGE_SE3:QUAT 0 1 1 2 3\n")
     (folder / "other.conf").write_text("bmesh chin.ply 0 0 0 0 0 0 1\n")
     m, r, a = "multiview", "register", "average"
@@ -44,6 +46,9 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "out below a file": ([r, *pair, "--out", "occupied/x"], "occupied"),
         "demo out": (["demo", "--out", "occupied"], "occupied"),
         "no budget": ([m, *pair, "--budget", "3"], "--budget 3: wanted a number"),
+        "no such frame": ([a, "g.g2o", "--fix", "9=1 0 0 0 1 0"], "no frame '9'"),
+        "no pose": ([a, "g.g2o", "--fix", "1"], "wanted FRAME=POSE"),
+        "no points": ([a, "g.g2o", "--control", "p.csv"], "p.csv, line 2: wanted a"),
         "no steps": ([a, "g.g2o", "--budget", "0"], "--budget 0: wanted at least 1"),
         "no such device": (["demo", "--device", "tpu"], "--device tpu: JAX finds none"),
         "bad seed": ([m, *pair, "--seed", "-1"], "--seed -1"),
@@ -57,7 +62,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
     }
 
 
-@pytest.mark.parametrize("kind", range(25))
+@pytest.mark.parametrize("kind", range(28))
 def test_bad_input_is_named_in_two_lines_with_exit_code_2(
     folder: Path, capsys: pytest.CaptureFixture[str], kind: int
 ):

@@ -220,6 +220,27 @@ def test_average_lowers_the_objective(folder: Path, capsys: pytest.CaptureFixtur
     assert "objective" in capsys.readouterr().out
 
 
+def test_average_goes_into_the_frame_of_what_is_known(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    (folder / "g.g2o").write_text(GRAPH)
+    # The middle frame turned by a quarter at (5, 6); the last one's origin is wrong.
+    rows = ["frame,px,py,x,y,sigma", "0,1,0,5,5,0.1", "2,0,0,4,6,0.1", "2,1,0,9,9,0.1"]
+    (folder / "c.csv").write_text("\n".join(rows))
+    pose = "1=0 -1 5 1 0 6"
+    known = ["--fix", pose, "--control", "c.csv"]
+    assert main(["average", "g.g2o", "--method", "plain", *known]) == 0
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    np.testing.assert_allclose(
+        found["T_world_i"][1], [[0, -1, 5], [1, 0, 6], [0, 0, 1]], atol=1e-12
+    )
+    assert found["fixed"] == [1]
+    assert [entry["frame"] for entry in found["known"]] == [0, 2, 2]
+    assert "Priors and control points" in capsys.readouterr().out
+    again = jaxreg.io.read_g2o_known("jaxreg-out/graph.g2o")
+    assert [frame for frame, _ in again.fixed] == [1]
+
+
 def test_average_reads_the_motions_of_fragments(folder: Path):
     edges = [(0, 1), (1, 2), (0, 2)]
     T = [np.linalg.inv(POSES[i]) @ POSES[j] for i, j in edges]
