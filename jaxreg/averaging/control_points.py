@@ -84,7 +84,9 @@ def fitted(
     T_world_i, ended, trust = problem.minimum(T)
     trust = trust[-len(points.frame) :]
     before = found.prior_weight
-    status = jnp.where(found.status == Status.CONVERGED, ended, found.status)
+    # Frames that no trusted edge holds stay where they were, as placed as before.
+    failed = (ended == Status.MAX_STEPS) | (ended == Status.NON_FINITE)
+    status = jnp.where(failed & (found.status == Status.CONVERGED), ended, found.status)
     if poses is None:
         status = jnp.where(spans(points.in_world, trust), status, Status.DEGENERATE)
     return eqx.tree_at(
@@ -116,7 +118,8 @@ class Adjustment(eqx.Module):
         moved = self.found.placed & ~known.fixed
         present = jnp.append(True, moved)
         end = average_graph(whole, PoseGraphLM(), start, None, present)
-        return jnp.where(moved[:, None, None], end.T_world_i[1:], T), end.status, trust
+        reached = (moved & end.placed[1:])[:, None, None]
+        return jnp.where(reached, end.T_world_i[1:], T), end.status, trust
 
     def whole(
         self, T: Float[Array, "v D D"]

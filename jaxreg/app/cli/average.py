@@ -81,7 +81,7 @@ def run(command: Average, session: Session) -> int:
     entries = known_entries(known, sol, report, ids)
     _write(session, graph, before, sol, ids, objective, report, known, entries)
     _show(session, graph, sol, objective)
-    show_known(session, entries, len(known.fixed))
+    show_known(session, entries, known, report, ids)
     _show_residuals(session, report, ids)
     outputs.show_end(session, FILES, command.out)
     return 0

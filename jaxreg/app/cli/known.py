@@ -130,10 +130,25 @@ def known_entries(
     ]
 
 
-def show_known(session: Session, entries: list[dict[str, Any]], num_fixed: int) -> None:
-    """What became of priors and control points; those that are not trusted by name."""
-    if num_fixed:
-        session.console.print(f"Poses held as they were given: {num_fixed}.")
+def show_known(
+    session: Session,
+    entries: list[dict[str, Any]],
+    known: KnownOfGraph,
+    report: EdgeReport,
+    ids: np.ndarray,
+) -> None:
+    """What became of all that was known; what is not trusted first."""
+    if known.fixed:
+        session.console.print(f"Poses held as they were given: {len(known.fixed)}.")
+    fixed = [frame for frame, _ in known.fixed]
+    own = ~np.isin(report.edges, fixed).all(axis=1)
+    for frame in fixed:
+        beside = own & (report.edges == frame).any(axis=1)
+        if beside.any() and not report.trusted[beside].any():
+            session.console.print(
+                f"Frame {ids[frame]} is held where none of its motions fits: is its "
+                "pose right?"
+            )
     if not entries:
         return
     table = Table(title="Priors and control points")
