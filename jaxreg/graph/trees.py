@@ -2,7 +2,7 @@
 
 All functions take `edges` and a weight per edge; edges of weight 0 (or NaN) are
 absent. Every loop takes O(e) work a round; the rounds are logarithmic in the number of
-frames, except for `shortest_paths`, whose rounds are the hops of its longest path.
+frames.
 
 By hand: `scipy.sparse.csgraph` runs on the host, outside `jit` and `vmap`.
 
@@ -159,76 +159,6 @@ def follow(
         return jnp.any(state[0] != state[0][state[0]])
 
     return control.while_loop(unfinished, jump, (parent, T_parent_i))
-
-
-class Paths(eqx.Module):
-    """A tree of shortest paths from one frame, the root.
-
-    Attributes:
-        T_root_i: `(v, d+1, d+1)` with the identity at frames that no path reaches.
-        reached: `(v,)` True for the frames reached.
-        parent: `(v,)` int32 the frame before, the frame itself at the root and where
-            none is.
-        via: `(v,)` int32 the edge from there, e where none is.
-    """
-
-    T_root_i: Float[Array, "v D D"]
-    reached: Bool[Array, " v"]
-    parent: Int[Array, " v"]
-    via: Int[Array, " v"]
-
-
-def shortest_paths(
-    edges: Int[Array, "e 2"],
-    T_i_j: Float[Array, "e D D"],
-    weight: Float[Array, " e"],
-    num_poses: int,
-    root: Int[Array, ""] | int = 0,
-) -> Paths:
-    """The paths from a frame of least total 1 / weight.
-
-    If weights are inverse variances, every frame gets the chain of least variance;
-    if they are all equal, this is a breadth-first tree (Bellman and Ford, in parallel).
-    Weights below a thousandth of the largest count as a thousandth.
-    """
-    edges, T_i_j, weight = jax.lax.stop_gradient((edges, T_i_j, weight))
-    i, j = edges[:, 0], edges[:, 1]
-    present = weight > 0
-    # Lengths from 1 to 1000, so that a step never vanishes in a float32 sum.
-    top = jnp.max(jnp.where(present, weight, 0))
-    length = jnp.minimum(top / jnp.where(present, weight, 1), 1000)
-    length = jnp.where(present, length, jnp.inf)
-
-    def relax(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        reach, _ = state
-        new = reach.at[j].min(reach[i] + length).at[i].min(reach[j] + length)
-        return new, jnp.any(new < reach)
-
-    start = jnp.full((num_poses,), jnp.inf, T_i_j.dtype).at[root].set(0)
-    reach, _ = control.while_loop(lambda s: s[1], relax, (start, jnp.asarray(True)))
-    reached = jnp.isfinite(reach)
-    # The parent is the best neighbour that is strictly nearer: no cycles by rounding.
-    via_i = jnp.where(reach[i] < reach[j], reach[i] + length, jnp.inf)
-    via_j = jnp.where(reach[j] < reach[i], reach[j] + length, jnp.inf)
-    best = (
-        jnp.full((num_poses,), jnp.inf, T_i_j.dtype).at[j].min(via_i).at[i].min(via_j)
-    )
-    num_edges = edges.shape[0]
-    order = jnp.arange(num_edges, dtype=jnp.int32)
-    none = 2 * num_edges
-    to_j = jnp.where(jnp.isfinite(via_i) & (via_i == best[j]), order, none)
-    to_i = jnp.where(jnp.isfinite(via_j) & (via_j == best[i]), order + num_edges, none)
-    code = jnp.full((num_poses,), none, jnp.int32).at[j].min(to_j).at[i].min(to_i)
-    has = code < none
-    backward = code >= num_edges
-    e = jnp.where(has, jnp.where(backward, code - num_edges, code), 0)
-    frames = jnp.arange(num_poses, dtype=jnp.int32)
-    parent = jnp.where(has, jnp.where(backward, j[e], i[e]), frames)
-    eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
-    T_parent = jnp.where(backward[:, None, None], lie.inverse(T_i_j[e]), T_i_j[e])
-    T_parent = jnp.where(has[:, None, None], T_parent, eye)
-    via = jnp.where(has, e, num_edges)
-    return Paths(follow(parent, T_parent)[1], reached, parent, via)
 
 
 def ancestors(parent: Int[Array, " v"]) -> Bool[Array, "v v"]:

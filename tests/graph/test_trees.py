@@ -7,11 +7,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxreg.graph import PoseGraph, trees
+from jaxreg.graph.shortest_paths import shortest_paths
 
 
 V, E = 12, 30
 maximum = jax.jit(trees.maximum_spanning_tree, static_argnums=3)
-shortest = jax.jit(trees.shortest_paths, static_argnums=3)
+shortest = jax.jit(shortest_paths, static_argnums=3)
 components = jax.jit(trees.components, static_argnums=2)
 
 
@@ -138,9 +139,7 @@ def test_paths_are_those_of_least_variance():
     edges = jnp.array([[0, 1], [1, 2], [0, 2]], jnp.int32)
     for direct, expected in ((3.0, 2.0), (1.5, 10.0)):
         weight = np.array([1, 1, 1 / direct], np.float32)
-        poses = trees.shortest_paths(
-            edges, jnp.asarray(T), jnp.asarray(weight), 3
-        ).T_root_i
+        poses = shortest_paths(edges, jnp.asarray(T), jnp.asarray(weight), 3).T_root_i
         np.testing.assert_allclose(poses[2, 0, 3], expected)
 
 

@@ -10,8 +10,8 @@ from jaxreg.averaging.base import (
     of_start,
     solution,
 )
-from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.shortest_paths import shortest_paths
 
 
 class ShortestPaths(AbstractAverager):
@@ -33,5 +33,5 @@ class ShortestPaths(AbstractAverager):
     ) -> AveragingSolution:
         """Chains the motions of a prepared graph."""
         args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
-        found = solution(graph, trees.shortest_paths(*args).T_root_i)
+        found = solution(graph, shortest_paths(*args).T_root_i)
         return of_start(self, graph, found)

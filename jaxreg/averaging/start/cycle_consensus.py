@@ -21,6 +21,7 @@ from jaxreg.averaging.start.cycles import edge_log_odds, judged
 from jaxreg.averaging.start.settle import settled
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.graph.shortest_paths import shortest_paths
 from jaxreg.linear.laplacian import DENSE_LIMIT
 
 
@@ -164,7 +165,7 @@ def _by_trees(graph: PoseGraph) -> AveragingSolution:
     args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
     T = jnp.stack(
         [
-            trees.shortest_paths(*args).T_root_i,
+            shortest_paths(*args).T_root_i,
             trees.maximum_spanning_tree(*args).T_world_i,
         ]
     )
@@ -203,9 +204,7 @@ def _shortest(graph: PoseGraph, odds: Array) -> Array:
     """Poses along the most probable path from frame 0 to each frame, coarsest odds."""
     doubt = jnp.clip(jax.nn.softplus(-odds[0]), 0.01, 10)  # -log of the trust
     weight = jnp.where(graph.weight > 0, 1 / doubt, 0)
-    return trees.shortest_paths(
-        graph.edges, graph.T_i_j, weight, graph.num_poses
-    ).T_root_i
+    return shortest_paths(graph.edges, graph.T_i_j, weight, graph.num_poses).T_root_i
 
 
 def _is_settled(graph: PoseGraph, odds: Array, T: Array) -> Array:
