@@ -9,7 +9,9 @@ from bench.records import Key, Metric, Records, Row
 
 
 #: By how much the ratio of CPU times to the reference may grow over the baseline's.
-SLACK = 1.8
+#: Machines differ in it, too: the same programs had 0.66 to 1.85 times the baseline's
+#: ratios on one that is slower (BruteForce 1.75, ICP 1.85).
+SLACK = 2.5
 
 
 class Verdict(NamedTuple):
