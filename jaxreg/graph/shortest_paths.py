@@ -126,7 +126,7 @@ class _Queue(NamedTuple):
     reach: Float[Array, " v"]  # lengths of the shortest paths so far
     ring: Int[Array, " v+1"]
     head: Int[Array, ""]
-    count: Int[Array, ""]
+    size: Int[Array, ""]
     told: Int[Array, ""]  # neighbours that the frame at the head has told
     waits: Int[Array, " v"]  # above 0 for frames that are in the ring and told none
 
@@ -144,11 +144,11 @@ def _in_turn(
         reach=jnp.full((num_poses,), jnp.inf, length.dtype).at[root].set(0),
         ring=jnp.zeros((num_poses + 1,), jnp.int32).at[0].set(root),
         head=0 * one,
-        count=one,
+        size=one,
         told=0 * one,
         waits=jnp.zeros((num_poses,), jnp.int32).at[root].set(1),
     )
-    end = control.while_loop(lambda q: q.count > 0, lambda q: _told(q, near), start)
+    end = control.while_loop(lambda q: q.size > 0, lambda q: _told(q, near), start)
     return end.reach
 
 
@@ -168,7 +168,7 @@ def _told(queue: _Queue, near: _Neighbours) -> _Queue:
     q, num = queue, len(queue.reach)
     place = jnp.arange(_WINDOW, dtype=jnp.int32)
     frame = q.ring[(q.head + place) % (num + 1)]
-    here = place < q.count
+    here = place < q.size
     first = near.begin[frame] + jnp.where(place == 0, q.told, 0)
     size = jnp.where(here, near.begin[frame + 1] - first, 0)
     end = jnp.cumsum(size, dtype=jnp.int32)
@@ -189,7 +189,7 @@ def _told(queue: _Queue, near: _Neighbours) -> _Queue:
     new = nearer & (waits[jnp.minimum(to, num - 1)] == 0)
     waits = waits.at[jnp.where(new, to, num)].max(place + 1, mode="drop")
     new = new & (waits[jnp.minimum(to, num - 1)] == place + 1)
-    tail = q.head + q.count + jnp.cumsum(new, dtype=jnp.int32) - 1
+    tail = q.head + q.size + jnp.cumsum(new, dtype=jnp.int32) - 1
     slot = jnp.where(new, tail % (num + 1), num + 1)
     gone = jnp.sum(done, dtype=jnp.int32)
     # The next has told some of its neighbours, if places were left for it.
@@ -199,7 +199,7 @@ def _told(queue: _Queue, near: _Neighbours) -> _Queue:
         reach=reach,
         ring=q.ring.at[slot].set(to, mode="drop"),
         head=(q.head + gone) % (num + 1),
-        count=q.count - gone + jnp.sum(new, dtype=jnp.int32),
-        told=jnp.where(gone < jnp.minimum(q.count, _WINDOW), told, 0),
+        size=q.size - gone + jnp.sum(new, dtype=jnp.int32),
+        told=jnp.where(gone < jnp.minimum(q.size, _WINDOW), told, 0),
         waits=waits,
     )

@@ -7,8 +7,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import MotionAveraging, average, pose_covariances
-from jaxreg.averaging.covariance import deviations
-from jaxreg.averaging.measures import length_scale
+from jaxreg.averaging.measures import deviations, length_scale
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import motions, random_graph, rotations
 
