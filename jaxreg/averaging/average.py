@@ -106,8 +106,8 @@ def average(
             `(i, p_i, p_world, information)`: frame i sees at `p_i` what lies at
             `p_world`, such as a target, or, with `p_i` the place of the antenna, a
             satellite fix. After `method` all is adjusted by `PoseGraphLM` with the
-            trust in edges held; up to half of the points may be wrong. Without priors
-            and fixed poses three that are on no line are needed (two in 2D).
+            trust in edges held; fewer than half of the points may be wrong. Without
+            priors and fixed poses three that are on no line are needed (two in 2D).
 
     Returns:
         An `AveragingSolution`, with leading axes for a batch; for a list a list of

@@ -1,4 +1,4 @@
-"""The place of one rigid body that brings it to surveyed points, half of them wrong."""
+"""The place of one rigid body that brings it to surveyed points, almost half wrong."""
 
 import itertools
 import math

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.checks import (
-    as_host_array,
+    as_host_numbers,
     check_rigid,
     is_concrete,
     shown,
@@ -115,7 +115,9 @@ def _array(x: object, at: str, shape: tuple[int, ...]) -> Any:
     if isinstance(x, jax.Array) and not is_concrete(x):
         found = x
     else:
-        found = as_host_array(x, at).astype(np.float64)
+        found = as_host_numbers(x, at)
+        if not np.isfinite(found).all():
+            raise ValueError(f"{at}: wanted finite numbers.")
     if found.shape != shape:
         raise ValueError(f"{at}: wanted shape {shape}, found {found.shape}.")
     return found

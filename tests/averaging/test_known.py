@@ -269,6 +269,7 @@ EYE, ZERO = np.eye(4), np.zeros(3)
         ({"fixed": [(1, EYE), (1, EYE)]}, "fixed[1]: frame 1 is fixed by fixed[0]"),
         ({"fixed": [(1.0, EYE)]}, "fixed[0]: wanted a frame's number"),
         ({"control": [(0, ZERO, ZERO)]}, "control: wanted at least 3 points"),
+        ({"control": [(0, ZERO, np.nan * ZERO)]}, "control[0]: wanted finite numbers"),
         ({"control": [(0, ZERO)]}, "control[0]: wanted (frame, point in it"),
         (
             {"control": [(0, ZERO, ZERO, np.eye(3)), *[(0, ZERO, ZERO)] * 2]},
