@@ -10,10 +10,10 @@ from jaxreg._core.log import log_solution
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
-from jaxreg.averaging.known import average_known
-from jaxreg.averaging.known_checks import check_known
 from jaxreg.averaging.many import average_batch, average_list, check_init
 from jaxreg.averaging.methods.correntropy import Correntropy
+from jaxreg.averaging.world.arguments import check_known
+from jaxreg.averaging.world.solve import average_known
 from jaxreg.batching.devices import chosen_devices
 from jaxreg.graph.pose_graph import PoseGraph, check_graph
 
@@ -96,8 +96,9 @@ def average(
             as `register` spreads pairs: without it they stay where a batch is.
         priors: what is nearly known of poses, a list of `(i, T_world_i)` or
             `(i, T_world_i, information)`, of one graph alone. The poses are then in
-            their frame, and frame 0 is held by nothing else. Each is an edge from the
-            world, which robust methods trust or not: see `prior_weight`. Information
+            their frame, and frame 0 is held by nothing else. After `method` all is
+            adjusted by `PoseGraphLM`, with the trust in edges held; how much each prior
+            is trusted is `prior_weight`, and fewer than half may be wrong. Information
             is of the right tangent error, as that of edges; without it a prior is as
             good as the middle edge.
         fixed: poses that are known exactly, a list of `(i, T_world_i)`. Edges between
@@ -105,9 +106,8 @@ def average(
         control: surveyed points, a list of `(i, p_i, p_world)` or
             `(i, p_i, p_world, information)`: frame i sees at `p_i` what lies at
             `p_world`, such as a target, or, with `p_i` the place of the antenna, a
-            satellite fix. After `method` all is adjusted by `PoseGraphLM` with the
-            trust in edges held; fewer than half of the points may be wrong. Without
-            priors and fixed poses three that are on no line are needed (two in 2D).
+            satellite fix. They are adjusted to as priors are. Without priors and fixed
+            poses three that are on no line are needed (two in 2D).
 
     Returns:
         An `AveragingSolution`, with leading axes for a batch; for a list a list of
@@ -115,11 +115,12 @@ def average(
         frame 0 by edges of positive weight, see `placed`.
         NON_FINITE: edges or poses with NaN or inf were met; such edges are ignored,
         such poses returned as the identity.
-        DEGENERATE: the control points that agree lie on a line.
-        MAX_STEPS: the steps ran out. NO_AGREEMENT: there are more motions than a tree
-        needs, and nothing agrees beyond what any tree agrees with (`log_evidence` is
-        at most 0, and so is that of the spanning tree of greatest weight); the poses
-        of `Correntropy` are then those of its start.
+        DEGENERATE: the control points that agree lie on a line; the poses are then in
+        no world. MAX_STEPS: the steps ran out. NO_AGREEMENT: there are more motions
+        than a tree needs, and nothing agrees beyond what any tree agrees with
+        (`log_evidence` is at most 0, and so is that of the spanning tree of greatest
+        weight); the poses of `Correntropy` are then those of its start. Or of priors
+        and control points, two and more, no more than half agree.
 
     Raises:
         TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,
@@ -135,7 +136,7 @@ def average(
     the answer needs them `T_world_i` is a NumPy array of float64.
 
     Gradients: see the method. `T_world_i` always follows `init[0]`, or what is known;
-    with control points it is differentiated at the adjustment, trust held.
+    with priors or points it is differentiated at the adjustment, trust held.
 
     Compilation: graphs of a list are padded to one of few numbers of poses, four an
     octave from 8 on, and to the edges of the largest that shares it; each such size

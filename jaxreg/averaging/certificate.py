@@ -20,7 +20,6 @@ import numpy as np
 from jaxreg._core.arrays import widened
 from jaxreg._core.checks import as_host_numbers, is_concrete, shown
 from jaxreg._core.status import Status
-from jaxreg.averaging.adjusted import check_solution
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.relaxation.certificate_matrix import CertificateMatrix
 from jaxreg.averaging.relaxation.connection import (
@@ -29,6 +28,7 @@ from jaxreg.averaging.relaxation.connection import (
     lifted,
     rigid,
 )
+from jaxreg.averaging.world.adjusted import check_solution
 from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
 
 

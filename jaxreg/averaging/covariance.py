@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import check_count
-from jaxreg.averaging.adjusted import Told, as_adjusted
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.measures import deviations
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
+from jaxreg.averaging.world.adjusted import Told, as_adjusted
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 

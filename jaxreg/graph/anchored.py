@@ -60,6 +60,48 @@ def anchored(graph: PoseGraph, known: KnownPoses) -> PoseGraph:
     )
 
 
+def without_priors(known: KnownPoses) -> KnownPoses:
+    """The fixed frames alone."""
+    info = known.information
+    return eqx.tree_at(
+        lambda k: (k.frame, k.T_world_prior, k.information),
+        known,
+        (
+            known.frame[:0],
+            known.T_world_prior[:0],
+            None if info is None else info[:0],
+        ),
+        is_leaf=lambda x: x is None,
+    )
+
+
+def fixed_as_priors(known: KnownPoses, num_fixed: int) -> KnownPoses:
+    """The fixed frames, so many, as nearly known."""
+    frame = jnp.nonzero(known.fixed, size=num_fixed)[0].astype(jnp.int32)
+    return KnownPoses(
+        frame=frame,
+        T_world_prior=known.T_world_fixed[frame],
+        information=None,
+        fixed=jnp.zeros_like(known.fixed),
+        T_world_fixed=known.T_world_fixed,
+    )
+
+
+def joined_priors(known: KnownPoses, more: KnownPoses) -> KnownPoses:
+    """With the priors of others after its own; all have information."""
+    assert known.information is not None
+    assert more.information is not None
+    return eqx.tree_at(
+        lambda k: (k.frame, k.T_world_prior, k.information),
+        known,
+        (
+            jnp.concatenate([known.frame, more.frame]),
+            jnp.concatenate([known.T_world_prior, more.T_world_prior]),
+            jnp.concatenate([known.information, more.information]),
+        ),
+    )
+
+
 def _from_world(
     graph: PoseGraph, known: KnownPoses, fixed_i: Array, fixed_j: Array
 ) -> tuple[Array, Array, Array | None]:

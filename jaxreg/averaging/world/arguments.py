@@ -14,7 +14,7 @@ from jaxreg._core.checks import (
     is_concrete,
     shown,
 )
-from jaxreg.averaging.control_points import ControlPoints
+from jaxreg.averaging.world.points import ControlPoints
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses
 from jaxreg.graph.pose_graph import PoseGraph
@@ -24,15 +24,17 @@ class Known(eqx.Module):
     """Poses and points that are known.
 
     Attributes:
-        poses: priors and fixed frames, or None without any.
+        poses: priors and fixed frames, of which there may be none.
         points: control points, or None without any.
         origin: `(d,)` float64 on the host, subtracted from all positions in the world,
             which may be map coordinates; None where a number is traced.
+        num_fixed: how many frames are fixed (static).
     """
 
-    poses: KnownPoses | None
+    poses: KnownPoses
     points: ControlPoints | None
-    origin: np.ndarray | None = None
+    origin: np.ndarray | None
+    num_fixed: int = eqx.field(static=True)
 
 
 def check_known(
@@ -63,7 +65,7 @@ def check_known(
     shift = np.zeros(d) if origin is None else origin
     poses = _known_poses(pose_rows, fixed_rows, shift, graph)
     points = _control_points(point_rows, shift, graph)
-    return Known(poses, points, origin)
+    return Known(poses, points, origin, len(fixed_rows))
 
 
 def _rows(
@@ -151,9 +153,7 @@ def _known_poses(
     fixed: list[tuple[Any, ...]],
     origin: np.ndarray,
     graph: PoseGraph,
-) -> KnownPoses | None:
-    if not (priors or fixed):
-        return None
+) -> KnownPoses:
     dtype, D = graph.T_i_j.dtype, graph.dim + 1
     shift = np.zeros((D, D))
     shift[:-1, -1] = origin
@@ -172,26 +172,35 @@ def _known_poses(
     given = [info for *_, info in priors]
     information = _information(given, graph)
     return KnownPoses(
-        jnp.asarray(frame), T_prior, information, jnp.asarray(is_fixed), T_fixed
+        frame=jnp.asarray(frame),
+        T_world_prior=T_prior,
+        information=information,
+        fixed=jnp.asarray(is_fixed),
+        T_world_fixed=T_fixed,
     )
 
 
 def _information(given: list[Any], graph: PoseGraph) -> Any:
     """Of priors; those that tell none are as good as the middle edge."""
-    info = graph.information
+    info, k = graph.information, lie.tangent_dim(graph.dim)
     if info is None:
-        told = [n for n, x in enumerate(given) if x is not None]
-        if told:
-            raise ValueError(
-                f"priors[{told[0]}]: information: the graph has none to compare it "
-                "with; leave it out, or give the edges theirs."
-            )
-        return None
-    k, dtype = info.shape[-1], info.dtype
+        _check_all_or_none(given, "priors")
+        if not given or given[0] is None:
+            return None
+        return jnp.stack([jnp.asarray(x, graph.T_i_j.dtype) for x in given])
     each = jnp.where(graph.mask[:, None], jnp.diagonal(info, axis1=1, axis2=2), jnp.nan)
     middle = jnp.diag(jnp.nanmedian(each, axis=0))
-    rows = [middle if x is None else jnp.asarray(x, dtype) for x in given]
-    return jnp.stack(rows) if rows else jnp.zeros((0, k, k), dtype)
+    rows = [middle if x is None else jnp.asarray(x, info.dtype) for x in given]
+    return jnp.stack(rows) if rows else jnp.zeros((0, k, k), info.dtype)
+
+
+def _check_all_or_none(given: list[Any], name: str) -> None:
+    told = [n for n, x in enumerate(given) if x is not None]
+    if told and len(told) < len(given):
+        missing = next(n for n, x in enumerate(given) if x is None)
+        raise ValueError(
+            f"{name}[{missing}]: wanted an information, as {name}[{told[0]}] has one."
+        )
 
 
 def _control_points(
@@ -201,12 +210,8 @@ def _control_points(
         return None
     dtype = graph.T_i_j.dtype
     given = [info for *_, info in rows]
-    told = [n for n, x in enumerate(given) if x is not None]
-    if told and len(told) < len(rows):
-        missing = next(n for n, x in enumerate(given) if x is None)
-        raise ValueError(
-            f"control[{missing}]: wanted an information, as control[{told[0]}] has one."
-        )
+    _check_all_or_none(given, "control")
+    told = given[0] is not None
     return ControlPoints(
         frame=jnp.asarray(np.array([row[0] for row in rows], np.int32)),
         in_frame=jnp.stack([jnp.asarray(row[1], dtype) for row in rows]),

@@ -18,25 +18,34 @@ from jaxreg.geometry.kabsch import kabsch
 _CHOICES = 256
 #: Deviations of right points that are tried, as shares of their extent.
 _LADDER = tuple(0.3 / 2 ** (n / 2) for n in range(32))
-#: Deviations that a right point may be off: those of a hundredth of right ones are
-#: larger (chi-square of three components).
-DEVIATIONS = 3.4
+#: The middle length of a vector of k normal numbers, and that which a hundredth of them
+#: exceed: roots of quantiles of chi-square.
+MEDIAN = {2: 1.177, 3: 1.538, 6: 2.313}
+FARTHEST = {2: 3.035, 3: 3.368, 6: 4.1}
 
 
 def likeliest_place(
-    seen: Float[Array, "c d"], in_world: Float[Array, "c d"], usable: Bool[Array, " c"]
-) -> Float[Array, "D D"]:
+    seen: Float[Array, "c d"],
+    in_world: Float[Array, "c d"],
+    usable: Bool[Array, " c"],
+    also: Float[Array, "n D D"] | None = None,
+) -> tuple[Float[Array, "D D"], Bool[Array, " c"]]:
     """`T_world_body`, the likeliest over the choices, then by all that agree with it.
+
+    Also which agree in the end.
 
     Args:
         seen: points of the body.
         in_world: where they lie in the world.
         usable: those that count.
+        also: more places to try beside those of some points.
     """
     num, d = seen.shape
     rows = jnp.asarray(_choices(num, min(d, num)))
     present = usable.astype(seen.dtype)
     tried = jax.vmap(lambda r: kabsch(seen[r], in_world[r], present[r]))(rows)
+    if also is not None:
+        tried = jnp.concatenate([tried, also])
 
     def squares(T: Array) -> Array:
         moved = jnp.sum(lie.rotation(T) * seen[:, None], axis=-1) + lie.translation(T)
@@ -48,14 +57,17 @@ def likeliest_place(
         tried
     )
     whole = jnp.all(usable[rows], axis=1)
+    if also is not None:
+        whole = jnp.concatenate([whole, jnp.ones(len(also), bool)])
     first = jnp.argmax(jnp.where(whole, scores, -jnp.inf))
     size = sizes[first]
 
     def closer(_: Array, T: Array) -> Array:
-        w = jnp.exp(-squares(T) / (DEVIATIONS * size) ** 2 / 2)
+        w = jnp.exp(-squares(T) / (FARTHEST[d] * size) ** 2 / 2)
         return kabsch(seen, in_world, present * w)
 
-    return control.fori_loop(0, 5, closer, tried[first])
+    T = control.fori_loop(0, 5, closer, tried[first])
+    return T, usable & (squares(T) < (FARTHEST[d] * size) ** 2)
 
 
 def _log_evidence(

@@ -9,8 +9,8 @@ import numpy as np
 
 from jaxreg._core.checks import shown
 from jaxreg.averaging.base import AveragingSolution
-from jaxreg.averaging.control_points import Adjustment
-from jaxreg.averaging.known_checks import check_known
+from jaxreg.averaging.world.adjustment import Adjustment
+from jaxreg.averaging.world.arguments import check_known
 from jaxreg.graph.anchored import anchored
 from jaxreg.graph.pose_graph import PoseGraph, check_graph
 
@@ -56,7 +56,7 @@ def as_adjusted(
     known = check_known(priors, fixed, control, graph)
     num = 0
     if known is not None:
-        num += 0 if known.poses is None else len(known.poses.frame)
+        num += len(known.poses.frame)
         num += 0 if known.points is None else len(known.points.frame)
     weight = solution.prior_weight
     told = 0 if weight is None else len(weight)
@@ -73,13 +73,10 @@ def as_adjusted(
     T = jnp.asarray(T, graph.T_i_j.dtype)
     own = solution.edge_weight
     whole, told_weight = graph, jnp.zeros(0) if weight is None else weight
-    if known.points is not None:
-        part = eqx.tree_at(lambda s: s.T_world_i, solution, T)
-        adjustment = Adjustment(graph, known.poses, known.points, part)
-        whole, poses, _ = adjustment.whole(T)
-    else:
-        assert known.poses is not None
-        poses = known.poses
+    poses = known.poses
+    if num:
+        all_of_it = Adjustment(graph, poses, known.points, own, solution.placed)
+        whole, poses, _ = all_of_it.whole(T)
     whole = anchored(whole, poses)
     eye = jnp.eye(graph.dim + 1, dtype=T.dtype)[None]
     at = lambda s: (s.T_world_i, s.edge_weight, s.placed, s.prior_weight)  # noqa: E731

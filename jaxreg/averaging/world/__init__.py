@@ -1,0 +1,1 @@
+"""Poses in a world of which some poses, or some points, are known."""

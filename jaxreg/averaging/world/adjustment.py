@@ -1,0 +1,271 @@
+"""Poses adjusted to all that is known of them: one least squares, robust by trust.
+
+Edges keep the trust that averaging gave them. Priors and control points are trusted by
+how far they are off, in standard deviations: by a Welsch kernel that a hundredth of the
+right ones leave. They are believed at their word, unless the middle one of three and
+more shows that their deviations are too small.
+
+Of two ways to an answer the one that explains more is taken: from where most of what is
+known fits the parts as they are, and, as drift may be larger than a wrong prior, from a
+kernel that takes all in and narrows (graduated non-convexity; Yang et al. 2020).
+
+Reference: Triggs et al. 2000, "Bundle adjustment: a modern synthesis" (gauge by control
+points).
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxreg._core import control
+from jaxreg._core.status import Status
+from jaxreg._core.typing import Key, Scalar, StatusArray
+from jaxreg.averaging.base import AveragingSolution
+from jaxreg.averaging.gauge import average_graph
+from jaxreg.averaging.measures import deviations, length_scale, nearest_rank
+from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM
+from jaxreg.averaging.world.points import ControlPoints
+from jaxreg.averaging.world.rigid_fit import FARTHEST, MEDIAN
+from jaxreg.geometry import lie
+from jaxreg.graph.anchored import KnownPoses, anchored, joined_priors
+from jaxreg.graph.pose_graph import PoseGraph, product
+
+
+#: Adjustments, each with the trust that the one before leaves.
+_ROUNDS = 5
+# Rows from which on their middle misfit says more than their own deviations.
+_ENOUGH = 3
+
+
+class _Minimum(NamedTuple):
+    T_world_i: Float[Array, "v D D"]
+    status: StatusArray
+    trust: Float[Array, " n"]  # in edges, priors and points, that it is by
+
+
+class _AtRest(PoseGraphLM):
+    """Poses that are at a minimum, with the derivatives that they have there."""
+
+    def solve(
+        self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
+    ) -> AveragingSolution:
+        """Init itself."""
+        assert init is not None
+        done = jnp.asarray(True)
+        return self.solution_at(graph, init, done, jnp.zeros((), jnp.int32), None)
+
+
+class Adjustment(eqx.Module):
+    """Edges, priors and points as one graph, by the trust that poses give them.
+
+    Attributes:
+        graph: the relative motions.
+        poses: priors and fixed frames.
+        points: control points, or None without any.
+        edge_weight: `(e,)` trust in the edges, held.
+        joined: `(v,)` frames that lie in the world.
+    """
+
+    graph: PoseGraph
+    poses: KnownPoses
+    points: ControlPoints | None
+    edge_weight: Float[Array, " e"]
+    joined: Bool[Array, " v"]
+
+    def solve(
+        self, T_start: Float[Array, "v D D"]
+    ) -> tuple[Float[Array, "v D D"], StatusArray, Float[Array, " k"]]:
+        """Poses, a status, and the trust in each prior, then in each point.
+
+        Gradients: by the graph, the poses and the points, trust held.
+        """
+        fixed, T_start = jax.lax.stop_gradient((self, T_start))
+        # The noise of edges is what they show before anything bends them.
+        fixed = eqx.tree_at(lambda a: a.graph, fixed, fixed._informed(T_start))
+        widest = jnp.maximum(fixed._widest(T_start), 1)
+        rounds = jnp.arange(_ROUNDS, dtype=widest.dtype)
+        narrowing = widest ** jnp.maximum(1 - rounds / (_ROUNDS - 2), 0)
+        widths = jnp.stack([jnp.ones_like(narrowing), narrowing])
+
+        def one(widths: Array) -> tuple[_Minimum, tuple[Array, Array]]:
+            def again(before: _Minimum, width: Array) -> tuple[_Minimum, None]:
+                return fixed._minimum(before.T_world_i, width), None
+
+            end, _ = control.scan(again, fixed._start(T_start), widths)
+            return end, fixed._sizes(end.T_world_i)
+
+        ends, sizes = jax.lax.map(one, widths)
+        least = jax.tree.map(lambda x: jnp.min(x, axis=0), sizes)
+        costs = jax.lax.map(lambda T: fixed._cost(T, least), ends.T_world_i)
+        best = jax.tree.map(lambda x: x[jnp.argmin(costs)], ends)
+        T = self._with_gradients(fixed.graph, best)
+        return T, best.status, best.trust[self.graph.num_edges :]
+
+    def whole(
+        self, T: Float[Array, "v D D"], width: Scalar | float = 1.0
+    ) -> tuple[PoseGraph, KnownPoses, Float[Array, " n"]]:
+        """The graph with information, all that is known as priors, and the trust.
+
+        Args:
+            T: poses.
+            width: of the kernel, over the usual.
+        """
+        graph, T = self._informed(T), jax.lax.stop_gradient(T)
+        sizes = self._sizes(T)
+        known = self._priors(graph)
+        if self.points is not None:
+            known = joined_priors(known, self.points.as_poses(T, sizes[1]))
+        trust = jnp.exp(-(self._ratios(T, sizes) ** 2) / (2 * width**2))
+        trust = jnp.where(self.usable, trust, 0)
+        return graph, known, jnp.concatenate([self._edge_trust(), trust])
+
+    def _start(self, T: Float[Array, "v D D"]) -> _Minimum:
+        num = self.graph.num_edges + len(self.usable)
+        status = jnp.asarray(Status.CONVERGED, jnp.int32)
+        return _Minimum(T, status, jnp.zeros(num, T.dtype))
+
+    def _minimum(self, T: Float[Array, "v D D"], width: Scalar) -> _Minimum:
+        """By the trust that the poses before give."""
+        graph, known, trust = self.whole(T, width)
+        T, status = self._adjusted(graph, known, trust, T, PoseGraphLM())
+        return _Minimum(T, status, trust)
+
+    def _with_gradients(self, informed: PoseGraph, at: _Minimum) -> Array:
+        """The same poses, with derivatives where the trust is held."""
+        graph = eqx.tree_at(lambda g: g.information, self.graph, informed.information)
+        moving = eqx.tree_at(lambda a: a.graph, self, graph)
+        _, known, _ = moving.whole(at.T_world_i)
+        return self._adjusted(graph, known, at.trust, at.T_world_i, _AtRest())[0]
+
+    def _adjusted(
+        self,
+        graph: PoseGraph,
+        known: KnownPoses,
+        trust: Float[Array, " n"],
+        T: Float[Array, "v D D"],
+        method: PoseGraphLM,
+    ) -> tuple[Array, StatusArray]:
+        """Poses by all of it; those that no trusted edge holds stay."""
+        whole = anchored(graph, known)
+        whole = eqx.tree_at(lambda g: g.weight, whole, whole.weight * trust)
+        start = jnp.concatenate([jnp.eye(graph.dim + 1, dtype=T.dtype)[None], T])
+        moved = self.joined & ~known.fixed
+        present = jnp.append(True, moved)
+        end = average_graph(whole, method, start, None, present)
+        reached = (moved & end.placed[1:])[:, None, None]
+        return jnp.where(reached, end.T_world_i[1:], T), end.status
+
+    def _edge_trust(self) -> Float[Array, " e"]:
+        """What is left of wrong edges would widen the noise."""
+        return jnp.where(self.edge_weight > 0.5, self.edge_weight, 0)
+
+    def _informed(self, T: Array) -> PoseGraph:
+        graph = self.graph
+        if graph.information is not None:
+            return graph
+        info = shown_information(graph, jax.lax.stop_gradient(T), self._edge_trust())
+        return eqx.tree_at(
+            lambda g: g.information, graph, info, is_leaf=lambda x: x is None
+        )
+
+    def _priors(self, graph: PoseGraph) -> KnownPoses:
+        """As good as an edge where nothing else is known of them."""
+        if self.poses.information is not None:
+            return self.poses
+        assert graph.information is not None
+        shape = (len(self.poses.frame), *graph.information.shape[1:])
+        usual = jnp.broadcast_to(graph.information[0], shape)
+        return eqx.tree_at(
+            lambda k: k.information, self.poses, usual, is_leaf=lambda x: x is None
+        )
+
+    @property
+    def usable(self) -> Bool[Array, " k"]:
+        """Priors and points that can count: those of free frames in the world."""
+        free = (self.joined & ~self.poses.fixed)[self.poses.frame]
+        if self.points is None:
+            return free
+        return jnp.concatenate([free, self.joined[self.points.frame]])
+
+    def _misfits(self, T: Array) -> tuple[Array, Array]:
+        """Of priors, over their median; of points, likewise or in lengths."""
+        known = self._priors(self._informed(T))
+        gap = product(lie.inverse(known.T_world_prior), T[known.frame])
+        error = lie.log(gap)
+        assert known.information is not None
+        turned = jnp.sum(known.information * error[:, None], axis=-1)
+        sq = jnp.maximum(jnp.sum(error * turned, axis=-1), 0)
+        of_poses = jnp.sqrt(sq) / MEDIAN[error.shape[-1]]
+        if self.points is None:
+            return of_poses, jnp.zeros(0, T.dtype)
+        return of_poses, self.points.misfit(T) / MEDIAN[self.graph.dim]
+
+    def _sizes(self, T: Array) -> tuple[Array, Array]:
+        """Deviations of priors and points: over those that are known, or in lengths."""
+        of_poses, of_points = self._misfits(T)
+        usable, num = self.usable, len(of_poses)
+        points = self.points
+        if points is None or points.information is not None:
+            size = _at_least_one(jnp.concatenate([of_poses, of_points]), usable)
+            return size, size
+        extent = jnp.max(jnp.abs(points.in_world - points.in_world[:1]))
+        least = jnp.maximum(1e-6 * extent, jnp.finfo(T.dtype).tiny ** 0.5)
+        middle = _lower_median(of_points, usable[num:])
+        return _at_least_one(of_poses, usable[:num]), jnp.maximum(middle, least)
+
+    def _ratios(self, T: Array, sizes: tuple[Array, Array]) -> Float[Array, " k"]:
+        """Misfits over those that a hundredth of right ones exceed."""
+        of_poses, of_points = self._misfits(T)
+        k, d = lie.tangent_dim(self.graph.dim), self.graph.dim
+        return jnp.concatenate(
+            [
+                of_poses / sizes[0] * (MEDIAN[k] / FARTHEST[k]),
+                of_points / sizes[1] * (MEDIAN[d] / FARTHEST[d]),
+            ]
+        )
+
+    def _widest(self, T: Array) -> Float[Array, ""]:
+        """The width that takes all in."""
+        ratios = jnp.where(self.usable, self._ratios(T, self._sizes(T)), 0)
+        return jnp.max(ratios, initial=0)
+
+    def _cost(self, T: Array, sizes: tuple[Array, Array]) -> Float[Array, ""]:
+        """Half of chi-square, of priors and points as far as the kernel counts it."""
+        graph = self._informed(T)
+        i, j = graph.edges[:, 0], graph.edges[:, 1]
+        gap = product(lie.inverse(graph.T_i_j), product(lie.inverse(T)[i], T[j]))
+        error = lie.log(gap)
+        assert graph.information is not None
+        turned = jnp.sum(graph.information * error[:, None], axis=-1)
+        present = graph.mask & self.joined[i] & self.joined[j]
+        weight = jnp.where(present, graph.weight * self._edge_trust(), 0)
+        edges = jnp.sum(weight * jnp.sum(error * turned, axis=-1)) / 2
+        k, d, num = lie.tangent_dim(graph.dim), graph.dim, len(self.poses.frame)
+        kernel = 1 - jnp.exp(-(self._ratios(T, sizes) ** 2) / 2)
+        most = jnp.where(jnp.arange(len(kernel)) < num, FARTHEST[k], FARTHEST[d]) ** 2
+        return edges + jnp.sum(jnp.where(self.usable, most * kernel, 0))
+
+
+def shown_information(graph: PoseGraph, T: Array, trust: Array) -> Array:
+    """Of the noise that the trusted edges leave."""
+    d, k = graph.dim, lie.tangent_dim(graph.dim)
+    least = 1e-5 * jnp.stack([length_scale(graph), jnp.ones((), T.dtype)])
+    noise = jnp.maximum(deviations(graph, T, trust), least)
+    each = jnp.concatenate([jnp.full(d, noise[0]), jnp.full(k - d, noise[1])])
+    return jnp.broadcast_to(jnp.diag(each**-2), (graph.num_edges, k, k))
+
+
+def _at_least_one(ratio: Array, usable: Array) -> Float[Array, ""]:
+    middle = _lower_median(ratio, usable)
+    return jnp.where(jnp.sum(usable) < _ENOUGH, 1, jnp.maximum(middle, 1))
+
+
+def _lower_median(x: Array, usable: Array) -> Float[Array, ""]:
+    """Of an even number the smaller: half of what is known may not outvote the rest."""
+    if len(x) == 0:
+        return jnp.ones((), x.dtype)
+    count = jnp.maximum(jnp.sum(usable) - 1, 1)
+    return nearest_rank(x, usable, jnp.floor((count) / 2) / count)

@@ -1,0 +1,87 @@
+"""Parts of a graph that were averaged on their own, brought into a known world."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core import control
+from jaxreg._core.typing import Scalar
+from jaxreg.averaging.world.points import ControlPoints
+from jaxreg.averaging.world.rigid_fit import likeliest_place, spans
+from jaxreg.geometry import lie
+from jaxreg.graph.anchored import KnownPoses
+from jaxreg.graph.pose_graph import product
+
+
+class Brought(NamedTuple):
+    """Poses to start from in the world.
+
+    Attributes:
+        T_world_i: `(v, d+1, d+1)`, as they were in parts that nothing holds.
+        held: `(v,)` frames of parts that poses hold, or points on no line.
+    """
+
+    T_world_i: Float[Array, "v D D"]
+    held: Bool[Array, " v"]
+
+
+def brought(
+    T_part_i: Float[Array, "v D D"],
+    part: Int[Array, " v"],
+    poses: KnownPoses,
+    points: ControlPoints | None,
+    unit: Scalar,
+) -> Brought:
+    """Each part as one rigid body, where most of what is known of it is fitted.
+
+    Args:
+        T_part_i: poses in a frame of each part's own; in parts with fixed frames they
+            are in the world.
+        part: the lowest number of the frames of each frame's part.
+        poses: priors and fixed frames.
+        points: control points.
+        unit: the length that stands for a radian.
+    """
+    v, d = len(part), T_part_i.shape[-1] - 1
+    # A pose is known by the places of its origin and of the tips of its axes.
+    tips = jnp.concatenate([jnp.zeros((1, d)), unit * jnp.eye(d)])
+    tips = tips.astype(T_part_i.dtype)
+    owner = jnp.repeat(poses.frame, d + 1)
+    T_seen = T_part_i[poses.frame]
+    seen = _moved(T_seen, tips).reshape(-1, d)
+    in_world = _moved(poses.T_world_prior, tips).reshape(-1, d)
+    tried = product(poses.T_world_prior, lie.inverse(T_seen))
+    if points is not None:
+        owner = jnp.concatenate([owner, points.frame])
+        seen = jnp.concatenate([seen, points.seen(T_part_i)])
+        in_world = jnp.concatenate([in_world, points.in_world])
+    fixed = jnp.zeros(v, bool).at[part].max(poses.fixed)
+    if len(owner) == 0:
+        return Brought(T_part_i, fixed[part])
+    posed = jnp.zeros(v, bool).at[part[poses.frame]].set(True)
+    is_point = jnp.arange(len(owner)) >= len(poses.frame) * (d + 1)
+
+    def fitted(name: Array) -> tuple[Array, Array]:
+        usable = part[owner] == name
+        T, agrees = likeliest_place(seen, in_world, usable, tried)
+        agrees = agrees & usable & is_point
+        return T, posed[name] | spans(in_world, agrees.astype(T.dtype))
+
+    def one(name: Array) -> tuple[Array, Array]:
+        known = jnp.any(part[owner] == name) & (part[name] == name) & ~fixed[name]
+        left = jnp.eye(d + 1, dtype=T_part_i.dtype), fixed[name]
+        return control.cond(known, fitted, lambda _: left, name)
+
+    T_world_part, held = jax.lax.map(one, jnp.arange(v, dtype=part.dtype))
+    held = held[part]
+    T = product(T_world_part[part], T_part_i)
+    T = jnp.where((held & ~fixed[part])[:, None, None], T, T_part_i)
+    return Brought(T, held)
+
+
+def _moved(T: Float[Array, "n D D"], x: Float[Array, "m d"]) -> Float[Array, "n m d"]:
+    """Points by each of some motions."""
+    R = lie.rotation(T)[:, None]
+    return jnp.sum(R * x[:, None, :], axis=-1) + lie.translation(T)[:, None]

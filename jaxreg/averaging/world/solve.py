@@ -1,0 +1,194 @@
+"""Averaging into a frame in which some poses, or some points, are known.
+
+Each part of a graph is averaged on its own, those with fixed frames beside these. Parts
+without are brought into the world as rigid bodies; then all is adjusted to all that is
+known.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxreg._core import control
+from jaxreg._core.checks import is_concrete
+from jaxreg._core.status import Status
+from jaxreg._core.typing import Key
+from jaxreg.averaging.base import AbstractAverager, AveragingSolution
+from jaxreg.averaging.gauge import average_graph
+from jaxreg.averaging.measures import length_scale
+from jaxreg.averaging.world.adjustment import Adjustment
+from jaxreg.averaging.world.arguments import Known
+from jaxreg.averaging.world.parts import brought
+from jaxreg.averaging.world.points import ControlPoints
+from jaxreg.geometry import lie
+from jaxreg.graph.anchored import (
+    KnownPoses,
+    anchored,
+    fixed_as_priors,
+    without_priors,
+)
+from jaxreg.graph.hang import with_hung
+from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.trees import components
+
+
+# Poses so many times further from the origin than from each other lose two digits.
+_FAR = 100.0
+
+
+def average_known(
+    graph: PoseGraph,
+    method: AbstractAverager,
+    known: Known,
+    init: Float[Array, "v D D"] | None,
+    key: Key | None,
+) -> AveragingSolution:
+    """`average` with priors, fixed frames and control points, all checked."""
+    if init is not None and known.origin is not None:
+        init = init.at[:, :-1, -1].add(-jnp.asarray(known.origin, init.dtype))
+    found = _averaged(graph, method, known, init, key, length_scale(graph))
+    if known.origin is None:
+        return found
+    in_world = found.placed & (found.status != Status.DEGENERATE)
+    T = moved_back(found.T_world_i, in_world, known.origin)
+    # Not by the constructor: JAX without x64 has no arrays of float64.
+    return eqx.tree_at(lambda s: s.T_world_i, found, T)
+
+
+def average_in_world(
+    graph: PoseGraph,
+    method: AbstractAverager,
+    known: Known,
+    init: Float[Array, "v D D"],
+) -> AveragingSolution:
+    """`average` from poses of parts on their own, less the world's origin.
+
+    The unit of length is that of the frames' contents: it stands for a radian.
+    """
+    unit = jnp.ones(())
+    if known.num_fixed:
+        label = components(graph.edges, graph.weight, graph.num_poses)
+        fixed = fixed_as_priors(known.poses, known.num_fixed)
+        held = jax.lax.stop_gradient((init, label, fixed))
+        init = brought(*held, None, unit).T_world_i
+    return _averaged(graph, method, known, init, None, unit)
+
+
+@eqx.filter_jit
+@control.over_devices
+def _averaged(
+    graph: PoseGraph,
+    method: AbstractAverager,
+    known: Known,
+    init: Float[Array, "v D D"] | None,
+    key: Key | None,
+    unit: Float[Array, ""],
+) -> AveragingSolution:
+    if known.num_fixed:
+        found, part = _of_parts_beside(graph, method, known.poses, init, key)
+    else:
+        found, part = _of_parts(graph, method, init, key)
+    return _adjusted(graph, known.poses, known.points, found, part, unit)
+
+
+def _adjusted(
+    graph: PoseGraph,
+    poses: KnownPoses,
+    points: ControlPoints | None,
+    found: AveragingSolution,
+    part: Int[Array, " v"],
+    unit: Float[Array, ""],
+) -> AveragingSolution:
+    """The parts brought into the world, and adjusted to what is known.
+
+    Args:
+        graph: the relative motions.
+        poses: priors and fixed frames.
+        points: control points.
+        found: of each part on its own, with the trust in its edges.
+        part: the lowest number of the frames of each frame's part.
+        unit: the length that stands for a radian.
+    """
+    held = jax.lax.stop_gradient((found.T_world_i, part, poses, points))
+    start = brought(*held, jax.lax.stop_gradient(unit))
+    T, status = found.T_world_i, found.status
+    trust = jnp.zeros(0, T.dtype)
+    if len(poses.frame) or points is not None:
+        problem = Adjustment(graph, poses, points, found.edge_weight, start.held)
+        T, ended, trust = problem.solve(start.T_world_i)
+        lost = (ended == Status.MAX_STEPS) | (ended == Status.NON_FINITE)
+        status = jnp.where(lost & (status == Status.CONVERGED), ended, status)
+        # Where half of what is known contradicts the rest, which is right is chance.
+        right, count = jnp.sum(trust > 0.5), jnp.sum(problem.usable)
+        undecided = (count > 1) & (2 * right <= count)
+        status = jnp.where(undecided, Status.NO_AGREEMENT, status)
+    beside = jnp.any(start.held)
+    joined = jnp.where(beside, start.held, part == part[0])
+    status = jnp.where(jnp.all(joined), status, Status.DISCONNECTED)
+    status = jnp.where(beside, status, Status.DEGENERATE)
+    label = jnp.where(joined, jnp.argmax(joined).astype(part.dtype), part)
+    return eqx.tree_at(
+        lambda s: (s.T_world_i, s.prior_weight, s.placed, s.component, s.status),
+        found,
+        (T, trust, joined, label, status.astype(jnp.int32)),
+        is_leaf=lambda x: x is None,
+    )
+
+
+def _of_parts(
+    graph: PoseGraph,
+    method: AbstractAverager,
+    init: Float[Array, "v D D"] | None,
+    key: Key | None,
+) -> tuple[AveragingSolution, Int[Array, " v"]]:
+    """Each part of a graph on its own, and the lowest number of its frames."""
+    label = components(graph.edges, graph.weight, graph.num_poses)
+    frame = jnp.arange(graph.num_poses, dtype=jnp.int32)
+    hung = (label == frame) & (label != label[0])
+    T_0_i = None if init is None else product(lie.inverse(init[:1]), init)
+    found = average_graph(with_hung(graph, hung, T_0_i), method, init, key)
+    trust = found.edge_weight[: graph.num_edges]
+    return eqx.tree_at(lambda s: s.edge_weight, found, trust), label
+
+
+def _of_parts_beside(
+    graph: PoseGraph,
+    method: AbstractAverager,
+    poses: KnownPoses,
+    init: Float[Array, "v D D"] | None,
+    key: Key | None,
+) -> tuple[AveragingSolution, Int[Array, " v"]]:
+    """The same of a graph with fixed frames, which are one frame, the world.
+
+    The parts that they hold are one part.
+    """
+    num, fixed = graph.num_poses, poses.fixed[:, None, None]
+    if init is not None:
+        eye = jnp.eye(graph.dim + 1, dtype=init.dtype)[None]
+        init = jnp.concatenate([eye, jnp.where(fixed, poses.T_world_fixed, init)])
+    whole = anchored(graph, without_priors(poses))
+    found, label = _of_parts(whole, method, init, key)
+    label = jnp.where(poses.fixed, 0, label[1:])
+    frame = jnp.arange(num, dtype=jnp.int32)
+    first = jax.ops.segment_min(frame, label, num + 1)
+    T_world_i = jnp.where(fixed, poses.T_world_fixed, found.T_world_i[1:])
+    trust = found.edge_weight[: graph.num_edges]
+    at = lambda s: (s.T_world_i, s.edge_weight)  # noqa: E731
+    return eqx.tree_at(at, found, (T_world_i, trust)), first[label]
+
+
+def moved_back(
+    T_world_i: Float[Array, "v D D"], placed: Bool[Array, " v"], origin: np.ndarray
+) -> Float[Array, "v D D"] | np.ndarray:
+    """In the frame of what is known; far from its origin in float64 on the host."""
+    T = T_world_i
+    if is_concrete(T) and T.dtype == jnp.float32 and np.any(placed):
+        wide = np.asarray(T, np.float64)
+        near = wide[np.asarray(placed), :-1, -1]
+        if np.sum(origin**2) > _FAR**2 * np.mean(np.sum(near**2, axis=-1)):
+            wide[:, :-1, -1] += np.where(np.asarray(placed)[:, None], origin, 0)
+            return wide
+    shift = jnp.where(jnp.asarray(placed)[:, None], jnp.asarray(origin, T.dtype), 0)
+    return T.at[:, :-1, -1].add(shift)
