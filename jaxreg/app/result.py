@@ -54,6 +54,9 @@ class Result:
         units: `(v,)` what coordinates of the files were multiplied by, None for one.
         attempt: whether the poses are shown, but not believed.
         aligned: files of whole scans in the common frame.
+        fixed: names of scans whose poses were held.
+        known: of each control point `kind`, `frame`, `weight`, `translation`; None
+            where the frame is that of the first scan.
     """
 
     names: list[str]
@@ -72,6 +75,8 @@ class Result:
     units: np.ndarray | None = None
     attempt: bool = False
     aligned: tuple[str, ...] = ()
+    fixed: tuple[str, ...] = ()
+    known: list[dict[str, Any]] | None = None
 
     @property
     def placed(self) -> np.ndarray:
@@ -176,6 +181,8 @@ def result_document(
         "versions": versions(),
         "files": result.files,
     }
+    if result.known is not None:
+        document |= {"fixed": list(result.fixed), "known": result.known}
     return document if errors is None else {**document, "errors": errors}
 
 

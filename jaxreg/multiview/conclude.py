@@ -13,8 +13,10 @@ from jaxreg.graph import PoseGraph
 from jaxreg.multiview.find_slipping import slipping
 from jaxreg.multiview.find_turnable import turnable
 from jaxreg.multiview.hold_poses import Held
+from jaxreg.multiview.known_world import KnownWorld
 from jaxreg.multiview.method import min_log_evidence
-from jaxreg.multiview.place import Placement, displacement, place, prior_weight
+from jaxreg.multiview.pair_trust import pair_trust
+from jaxreg.multiview.place import Placement, place, prior_weight
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -32,6 +34,7 @@ def finish(
     scans: PreparedScans,
     motions: RelativeMotions,
     hold: Held | None = None,
+    known: KnownWorld | None = None,
 ) -> ReconstructionSolution:
     """Averages, refines, and returns to the frames and unit of the input.
 
@@ -41,19 +44,28 @@ def finish(
         scans: prepared scans.
         motions: of pairs, in the scans' centred frames; some may be padding.
         hold: old frames that stay, or None.
+        known: what is known of the world, less its origin, or None.
     """
     moving, scans = scans, lax.stop_gradient(scans)
     least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
     placement = place(motions, scans.num_scans, averaging, least)
     mode, turns = placement.mode, turnable(motions, placement)
-    placement = refine(moving, placement, averaging, least - _VOUCHED)
-    if hold is None:
-        free = turns | slipping(scans, placement, least)
+    placement, measured = refine(moving, placement, averaging, least - _VOUCHED)
+    if hold is not None:
+        placement = hold.place(scans, placement, averaging, least - _VOUCHED)
+        free = (turns | slipping(scans, placement, least)) & ~hold.held
+        solution = _solution(scans, motions, mode, placement, free, least)
+        return hold.in_world(solution)
+    free = turns | slipping(scans, placement, least)
+    if known is None:
         return _solution(moving, motions, mode, placement, free, least)
-    placement = hold.place(scans, placement, averaging, least - _VOUCHED)
-    free = (turns | slipping(scans, placement, least)) & ~hold.held
-    solution = _solution(scans, motions, mode, placement, free, least)
-    return hold.in_world(solution)
+    likely = least - _VOUCHED
+    placement, trust = known.place(scans, placement, measured, averaging, likely)
+    free = free & ~known.fixed
+    solution = _solution(moving, motions, mode, placement, free, least)
+    return eqx.tree_at(
+        lambda s: s.prior_weight, solution, trust, is_leaf=lambda x: x is None
+    )
 
 
 @eqx.filter_jit
@@ -78,9 +90,12 @@ def _solution(
     found_status = jnp.where(agreed, Status.CONVERGED, Status.NO_AGREEMENT)
     scan_status = jnp.where(placed, found_status, scan_status)
     scan_status = jnp.where(free & (component >= 0), Status.AMBIGUOUS, scan_status)
+    scan_status = jnp.where(placement.misfit, Status.NO_AGREEMENT, scan_status)
     scan_status = jnp.where(scans.usable, scan_status, scans.fault)
     status = jnp.where(jnp.any(free & placed), Status.AMBIGUOUS, found_status)
     status = jnp.where(jnp.all(placed), status, Status.DISCONNECTED)
+    unheld = placement.status == Status.DEGENERATE
+    status = jnp.where(unheld, Status.DEGENERATE, status)
     trace = placement.trace
     return ReconstructionSolution(
         T_world_i=_in_first_frames(scans, placement),
@@ -90,7 +105,7 @@ def _solution(
         component=component,
         graph=graph,
         overlap=overlap,
-        edge_weight=_trust(scans, motions.of_modes(mode), placement, weight),
+        edge_weight=pair_trust(scans, motions.of_modes(mode), placement, weight),
         inlier_rmse=one.inlier_rmse[:, 0],
         mode=mode,
         motions=found,
@@ -99,30 +114,18 @@ def _solution(
     )
 
 
-def _trust(
-    scans: PreparedScans,
-    motions: RelativeMotions,
-    placement: Placement,
-    weight: Float[Array, " e"],
-) -> Float[Array, " e"]:
-    """Agreement of one motion of each pair with the poses; the radius is one."""
-    i, j = motions.pairs[:, 0], motions.pairs[:, 1]
-    T_world_i = placement.T_world_i
-    T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
-    turn, shift = displacement(T_i_j, motions.T_i_j[:, 0])
-    sq = turn**2 + shift**2
-    spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
-    trust = jnp.exp(-sq / (2 * jnp.maximum(spacing, 1e-6) ** 2))
-    return jnp.where((weight > 0) & placement.together(i, j), trust, 0)
-
-
 def _in_first_frames(
     scans: PreparedScans, placement: Placement
 ) -> Float[Array, "v D D"]:
-    """Poses relative to the first scan of each part, in the input's frames and unit."""
+    """Poses in the frame of each part's first scan, or in the world that is known.
+
+    In the input's frames and unit.
+    """
     first = placement.part
     ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
     T_first_i = lie.inverse(placement.T_world_i[first]) @ placement.T_world_i
     T = scans.to_input_frames(T_first_i, first, ids)
     eye = jnp.eye(T.shape[-1], dtype=T.dtype)
-    return jnp.where((ids != first)[:, None, None], T, eye)
+    T = jnp.where((ids != first)[:, None, None], T, eye)
+    in_world = scans.to_world(placement.T_world_i)
+    return jnp.where((first == placement.world)[:, None, None], in_world, T)

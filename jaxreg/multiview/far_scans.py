@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.checks import as_host_numbers
+from jaxreg.averaging.world.adjusted import Told
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.registration.far import near_origin, pose_back, pose_moved
 
 
+_Known = tuple[Told, Told, Told]
 OnPairs = Callable[[RelativeMotions], None]
 
 
@@ -81,17 +83,47 @@ class FarScans:
             return previous
         return self._solution(previous, pose_moved)
 
+    def known(self, priors: Told, fixed: Told, control: Told) -> _Known:
+        """What is known, checked before, of the moved frames."""
+        if not self.moved:
+            return priors, fixed, control
+        for n, row in enumerate(priors or ()):
+            if self.origin[row[0]].any() and len(row) > 2 and row[2] is not None:
+                raise ValueError(
+                    f"priors[{n}]: information: scan {row[0]} is far from its origin, "
+                    "where a turn is a large shift: leave it out, or give control "
+                    "points."
+                )
+        poses, held = (
+            [(row[0], self._pose_moved(*row[:2]), *row[2:]) for row in rows or ()]
+            for rows in (priors, fixed)
+        )
+        points = [
+            (row[0], np.asarray(row[1], np.float64) - self.origin[row[0]], *row[2:])
+            for row in control or ()
+        ]
+        return poses, held, points
+
+    def _pose_moved(self, frame: int, T: object) -> np.ndarray:
+        T = as_host_numbers(T, "T")
+        return pose_moved(T, self.origin[frame], np.zeros(T.shape[-1] - 1))
+
     def hears(self, on_pairs: OnPairs | None) -> OnPairs | None:
         """Tells of motions between the frames of the input."""
         if on_pairs is None or not self.moved:
             return on_pairs
         return lambda motions: on_pairs(self._motions(motions, pose_back))
 
-    def back(self, solution: ReconstructionSolution) -> ReconstructionSolution:
-        """Between the frames of the input, in float64 on the host."""
-        if not self.moved:
-            return solution
-        return self._solution(solution, pose_back)
+    def back(
+        self, solution: ReconstructionSolution, world: np.ndarray | None = None
+    ) -> ReconstructionSolution:
+        """Between the frames of the input, in float64 on the host.
+
+        Args:
+            solution: between the moved frames.
+            world: the origin of what component 0 lies in, if that is a known world.
+        """
+        return self._solution(solution, pose_back, world) if self.moved else solution
 
     def _motions(self, motions: RelativeMotions, change: Callable) -> RelativeMotions:
         i, j = (self.origin[x] for x in np.asarray(motions.pairs).T)
@@ -99,13 +131,19 @@ class FarScans:
         return eqx.tree_at(lambda m: m.T_i_j, motions, T)
 
     def _solution(
-        self, solution: ReconstructionSolution, change: Callable
+        self,
+        solution: ReconstructionSolution,
+        change: Callable,
+        world: np.ndarray | None = None,
     ) -> ReconstructionSolution:
         # The world of a component is the frame of its first scan.
         component = np.asarray(solution.component)
         first = np.argmax(component[:, None] == component, axis=1)
         origin = self.origin[: len(component)]
-        T = change(np.asarray(solution.T_world_i), origin, origin[first])
+        there = origin[first]
+        if world is not None:
+            there = np.where((component == 0)[:, None], world, there)
+        T = change(np.asarray(solution.T_world_i), origin, there)
         alone = component < 0
         T[alone] = np.eye(T.shape[-1])
         i, j = (self.origin[x] for x in np.asarray(solution.graph.edges).T)

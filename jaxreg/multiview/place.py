@@ -18,6 +18,7 @@ from jaxreg.averaging import (
     average,
 )
 from jaxreg.geometry import lie
+from jaxreg.graph.hang import with_hung
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import components
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -33,8 +34,6 @@ _PASSES = 2
 # Pairs that `register` would not believe may count where others confirm them: those
 # whose log evidence is at most so much below.
 _CONFIRMABLE = 1.0
-# The weight of motions of no consequence.
-_HUNG = 0.1
 
 
 class Placement(eqx.Module):
@@ -48,6 +47,8 @@ class Placement(eqx.Module):
         mode: `(e,)` int32, which of each pair's modes was averaged.
         status: of the averaging.
         trace: of the averaging.
+        world: int32 the part that lies in a world that is known, -1 if there is none.
+        misfit: `(v,)` scans that are held in the world where no pair has them.
     """
 
     T_world_i: Float[Array, "v D D"]
@@ -56,14 +57,18 @@ class Placement(eqx.Module):
     mode: Int[Array, " e"]
     status: StatusArray
     trace: AveragingTrace | None
+    world: Int[Array, ""]
+    misfit: Bool[Array, " v"]
 
     @property
     def component(self) -> Int[Array, " v"]:
         """`(v,)` number of each scan's part, the largest first; -1 of scans alone.
 
-        Where every scan is alone, the first of them is the largest part.
+        Where every scan is alone, the first of them is the largest part. The part that
+        lies in a known world comes before all.
         """
         size = part_sizes(self.part)
+        size = jnp.where(self.part == self.world, size + len(size), size)
         ids = jnp.arange(len(size), dtype=jnp.int32)
         first = self.part == ids
         larger = size[None, :] > size[:, None]
@@ -138,14 +143,22 @@ def _averaged(
     # Averaging fixes frame 0: swap the root's number with 0.
     swap = ids.at[root].set(0).at[0].set(root)
     graph = PoseGraph(swap[pairs], T_i_j, trusted, trusted > 0, None, num_scans)
-    solution = average(_with_hung(graph, hung[swap]), averaging)
+    solution = average(with_hung(graph, hung[swap]), averaging)
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
     agreed = jnp.where(joins(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
     strong = log_evidence >= least + math.log(max(num_scans - 1, 1))
     part = _confirmed_components(pairs, agreed, num_scans, strong)
-    T_world_i, status, trace = solution.T_world_i[swap], solution.status, solution.trace
-    return Placement(T_world_i, part, edge_weight, mode, status, trace)
+    return Placement(
+        T_world_i=solution.T_world_i[swap],
+        part=part,
+        edge_weight=edge_weight,
+        mode=mode,
+        status=solution.status,
+        trace=solution.trace,
+        world=jnp.asarray(-1, jnp.int32),
+        misfit=jnp.zeros(num_scans, bool),
+    )
 
 
 def _agreeing(
@@ -179,23 +192,6 @@ def in_main_body(body: Int[Array, " v"], part: Int[Array, " v"]) -> Bool[Array, 
     same = part[:, None] == part[None, :]
     largest = jnp.argmax(jnp.where(same, part_sizes(body)[None, :], 0), axis=1)
     return body == body[largest]
-
-
-def _with_hung(graph: PoseGraph, hung: Bool[Array, " v"]) -> PoseGraph:
-    """With a motion from frame 0 to each frame of `hung`: none contradicts it."""
-    num, D = hung.shape[0], graph.T_i_j.shape[-1]
-    ids = jnp.where(hung, jnp.arange(num, dtype=jnp.int32), 0)
-    eye = jnp.broadcast_to(jnp.eye(D, dtype=graph.T_i_j.dtype), (num, D, D))
-    return PoseGraph(
-        jnp.concatenate([graph.edges, jnp.stack([jnp.zeros_like(ids), ids], axis=1)]),
-        jnp.concatenate([graph.T_i_j, eye]),
-        jnp.concatenate(
-            [graph.weight, jnp.where(hung, _HUNG, 0).astype(graph.weight.dtype)]
-        ),
-        jnp.concatenate([graph.mask, hung]),
-        None,
-        num,
-    )
 
 
 def likely(motions: RelativeMotions, least: Scalar) -> Bool[Array, "e m"]:

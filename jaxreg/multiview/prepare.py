@@ -112,6 +112,12 @@ class PreparedScans(eqx.Module):
         t = lie.translation(T_i_j) + moved - self.mean[i]
         return lie.compose(R, t / self.radius)
 
+    def to_world(self, T_world_i: Motions) -> Motions:
+        """Poses of the centred frames, in radii, as those of the input frames."""
+        R = lie.rotation(T_world_i)
+        t = self.radius * lie.translation(T_world_i)
+        return lie.compose(R, t - jnp.sum(R * self.mean[:, None], axis=-1))
+
 
 def clean(
     points: Float[Array, "v n d"], mask: Bool[Array, "v n"]

@@ -26,11 +26,13 @@ from jaxreg._core.checks import (
 from jaxreg._core.log import log_solution, log_stage
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging import AbstractAverager
+from jaxreg.averaging.world.adjusted import Told
 from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
 from jaxreg.multiview.choose_pairs import Order, all_pairs, first_pairs
 from jaxreg.multiview.conclude import finish
 from jaxreg.multiview.far_scans import FarScans
 from jaxreg.multiview.hold_poses import Held
+from jaxreg.multiview.known_world import KnownWorld
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.prepare import PreparedScans, prepare_scans
 from jaxreg.multiview.register_pairs import OnPairs, Rounds
@@ -52,6 +54,9 @@ def reconstruct(
     order: Order | str = "any",
     previous: object = None,
     hold_previous: bool = False,
+    priors: Told = None,
+    fixed: Told = None,
+    control: Told = None,
     progress: Progress | None = None,
     on_pairs: OnPairs | None = None,
 ) -> ReconstructionSolution:
@@ -85,6 +90,15 @@ def reconstruct(
         hold_previous: whether the scans that are placed in the `previous` solution keep
             the poses that they have there, to the last digit, and new ones lie beside
             them in its world; else all poses are found anew.
+        priors: what is nearly known of poses, a list of `(i, T_world_i)` or
+            `(i, T_world_i, information)` of the right tangent error. The answer is then
+            in their world. Wrong ones are not trusted: see `prior_weight`.
+        fixed: poses that are known exactly, a list of `(i, T_world_i)`.
+        control: surveyed points, a list of `(i, p_i, p_world)` or
+            `(i, p_i, p_world, information)`: scan i sees at `p_i` what lies at
+            `p_world`, such as a target or, with `p_i` the place of the antenna, a
+            satellite fix. See `average`, which takes the same three; parts that no
+            overlap joins meet in the world.
         progress: called as `progress(stage, done, total)`; not under `jit`.
         on_pairs: called with the `RelativeMotions` of every few pairs as they are
             found, in the input's frames and unit, as NumPy arrays with motions in
@@ -101,7 +115,9 @@ def reconstruct(
         DISCONNECTED where some scans could not be placed, AMBIGUOUS where some can slip
         along the others; `scan_status` says which, and what is wrong with them.
         NO_AGREEMENT where no pairs agree with each other: scans then lie as the pairs
-        of largest overlap have them.
+        of largest overlap have them; and of a scan that is fixed where none of its
+        pairs has it. DEGENERATE where what is known holds no part of the scans, as of
+        points on a line.
 
     Gradients:
         Of `T_world_i`, by the points of all scans: implicit where the last steps of
@@ -125,21 +141,24 @@ def reconstruct(
     method = ParticleFilter() if method is None else method
     check_method(method, AbstractRegistrar)
     check_instance(averaging, "averaging", AbstractAverager | None)
-    if hold_previous and not isinstance(previous, ReconstructionSolution):
-        raise ValueError(
-            "hold_previous: wanted a ReconstructionSolution as previous, found "
-            f"{type(previous).__name__}."
-        )
+    known = KnownWorld.of(priors, fixed, control, points)
+    if hold_previous:
+        _check_can_hold(previous, known)
     if positions is not None:
         positions.check_fits(points, method)
     inputs = points, row_mask, eyes, cast_floats(positions, points.dtype)
+    if far.moved:
+        known = KnownWorld.of(*far.known(priors, fixed, control), points)
     key, order = check_key(key), _checked(order)
     if not (is_concrete(points) and is_concrete(key)):
         if order != "any" or not (previous is None and on_pairs is None):
             raise ValueError(
                 "order, previous, on_pairs: pairs are chosen outside of jit only."
             )
-        return _of_all_pairs(method, averaging, inputs, key)
+        solution = _of_all_pairs(method, averaging, inputs, key, known)
+        if known is None:
+            return solution
+        return known.in_world(solution, fixed, moved=False)
 
     def report(stage: str, done: int, total: int) -> None:
         log_stage(stage, done, total)
@@ -149,18 +168,22 @@ def reconstruct(
     report("preparing scans", 0, 1)
     prepared = jax.block_until_ready(prepare_scans(method, *inputs))
     report("preparing scans", 1, 1)
-    known, first = _known(previous, prepared, order)
-    rounds = Rounds(method, averaging, prepared, key, known, on_pairs, report)
+    before, first = _known(previous, prepared, order)
+    rounds = Rounds(method, averaging, prepared, key, before, on_pairs, report)
     motions = rounds.run(order, first)
     report("averaging and refining", 0, 1)
     hold = None
     if hold_previous and isinstance(previous, ReconstructionSolution):
         hold = Held.of(previous, prepared.num_scans)
     motions_padded = motions.padded(rounds.most)
-    solution = finish(method, averaging, prepared, motions_padded, hold)
+    solution = finish(method, averaging, prepared, motions_padded, hold, known)
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
-    solution = far.back(solution.of_pairs(len(motions.overlap)))
+    solution = solution.of_pairs(len(motions.overlap))
+    origin = None if known is None else known.origin_of(solution)
+    solution = far.back(solution, origin)
+    if known is not None:
+        solution = known.in_world(solution, fixed, moved=far.moved)
     log_solution("reconstruct", solution)
     return solution
 
@@ -170,13 +193,14 @@ def _of_all_pairs(
     averaging: AbstractAverager | None,
     inputs: tuple[Any, ...],
     key: Key,
+    known: KnownWorld | None,
 ) -> ReconstructionSolution:
     """What can be traced: no pair is chosen by what others told."""
     prepared = prepare_scans(method, *inputs, side_by_side=True)
     pairs = jnp.asarray(all_pairs(prepared.num_scans))
     method, held = jax.lax.stop_gradient((method, prepared))
     motions = relative_motions(method, held, pairs, key)
-    return finish(method, averaging, prepared, motions)
+    return finish(method, averaging, prepared, motions, None, known)
 
 
 def _known(
@@ -213,6 +237,18 @@ def _known(
         first = np.concatenate([motions.pairs, new[new[:, 1] >= num_old]])
         first = np.unique(first, axis=0)
     return motions.heard(scans), first
+
+
+def _check_can_hold(previous: object, known: KnownWorld | None) -> None:
+    if not isinstance(previous, ReconstructionSolution):
+        raise ValueError(
+            "hold_previous: wanted a ReconstructionSolution as previous, found "
+            f"{type(previous).__name__}."
+        )
+    if known is not None or previous.prior_weight is not None:
+        raise ValueError(
+            "hold_previous: in a world that is known give the poses to hold as fixed=."
+        )
 
 
 def _checked(order: str) -> Order:

@@ -38,7 +38,7 @@ def refine(
     placement: Placement,
     averaging: AbstractAverager | None,
     least: Scalar,
-) -> Placement:
+) -> tuple[Placement, RelativeMotions]:
     """Poses from all pairs of placed scans that overlap, measured anew.
 
     They have derivatives by the points of the scans: of the last round, which matches
@@ -51,19 +51,21 @@ def refine(
         least: log evidence of the pairs that count.
 
     Returns:
-        The placement by these pairs. Scans that no pair holds any more keep their
-        poses, but are alone.
+        The placement by these pairs, and the pairs. Scans that no pair holds any more
+        keep their poses, but are alone.
     """
     averaging = wide_unless_given(averaging)
     moving, scans = scans, lax.stop_gradient(scans)
-    for exact in (False, True):
-        motions = measured(scans, placement, least, exact=exact)
-        if exact:
-            optimiser, width = _optimiser(motions.T_i_j), _widths(moving, placement)[-1]
-            motions = follow_points(moving, motions, optimiser, width, least)
+
+    def averaged(motions: RelativeMotions) -> Placement:
         again = place(motions, scans.num_scans, averaging, least)
-        placement = _updated(placement, again)
-    return placement
+        return _updated(placement, again)
+
+    placement = averaged(measured(scans, placement, least, exact=False))
+    motions = measured(scans, placement, least, exact=True)
+    optimiser, width = _optimiser(motions.T_i_j), _widths(moving, placement)[-1]
+    motions = follow_points(moving, motions, optimiser, width, least)
+    return averaged(motions), motions
 
 
 def wide_unless_given(averaging: AbstractAverager | None) -> AbstractAverager:

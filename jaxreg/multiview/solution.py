@@ -19,10 +19,12 @@ class ReconstructionSolution(eqx.Module):
 
     Attributes:
         T_world_i: `(v, d+1, d+1)` maps scan i to the world of its component, which is
-            the frame of the component's first scan. Identity for scans alone.
+            the frame of the component's first scan, or that of what is known. Identity
+            for scans alone.
         status: int32; CONVERGED if every scan is placed, AMBIGUOUS if some of them
             could as well lie otherwise, NO_AGREEMENT if no pairs agree with each other;
-            DISCONNECTED if some are not placed.
+            DISCONNECTED if some are not placed; DEGENERATE if what is known of the
+            world holds no part of them: poses are then relative ones.
         scan_status: `(v,)` int32; CONVERGED (or NO_AGREEMENT, see `status`) where
             placed, DISCONNECTED in another component; AMBIGUOUS where the surfaces of
             no two scans together keep a scan from slipping along the rest of its
@@ -31,8 +33,9 @@ class ReconstructionSolution(eqx.Module):
             or UNIT_DIFFERS.
         placed: `(v,)` the scans of component 0.
         component: `(v,)` int32, the scans that trusted pairs join have one number: 0 is
-            the component of most scans, -1 stands for scans alone. Nothing is known
-            of how two components lie.
+            the component of most scans, or all that what is known brings into the
+            world, -1 stands for scans alone. Nothing is known of how two components
+            lie.
         graph: every pair that was registered, `T_i_j` in the input's frames and unit,
             of the mode that agrees with the other pairs, of the best mode if none does;
             prior weight the overlap where it is trusted and else 0.
@@ -47,6 +50,8 @@ class ReconstructionSolution(eqx.Module):
         num_dropped: `(v,)` rows that were not finite.
         trace: how the averaging that chose the pairs came to rest, lengths in the unit
             of the input; None if its method takes no steps.
+        prior_weight: `(p,)` how far each prior is trusted, then each control point,
+            from 0 to 1; 0 for priors of scans that are fixed. None without any.
     """
 
     T_world_i: Float[Array, "v D D"]
@@ -62,6 +67,7 @@ class ReconstructionSolution(eqx.Module):
     motions: RelativeMotions
     num_dropped: Int[Array, " v"]
     trace: AveragingTrace | None = None
+    prior_weight: Float[Array, " p"] | None = None
 
     @property
     def num_scans(self) -> int:

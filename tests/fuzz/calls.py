@@ -269,6 +269,9 @@ def _reconstructions() -> Iterator[Call]:
         "order": "any",
         "previous": None,
         "hold_previous": False,
+        "priors": [(1, np.eye(4), np.eye(6))],
+        "fixed": [(0, np.eye(4))],
+        "control": [(2, np.zeros(3), np.ones(3), np.eye(3))],
         "progress": None,
         "on_pairs": None,
     }

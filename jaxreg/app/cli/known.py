@@ -1,4 +1,4 @@
-"""What is known of a graph's poses: lines of its file, `--control` and `--fix`."""
+"""What is known of poses: lines of a graph's file, `--control` and `--fix`."""
 
 import csv
 from pathlib import Path
@@ -8,13 +8,14 @@ import numpy as np
 from rich.table import Table
 
 from jaxreg.app.cli.guess import read_guess
-from jaxreg.app.cli.options import Average
+from jaxreg.app.cli.options import Average, Multiview
 from jaxreg.app.cli.runtime import Session
 from jaxreg.averaging import AveragingSolution, EdgeReport
 from jaxreg.io.errors import InputError
 from jaxreg.io.files import text_lines
 from jaxreg.io.graphs.g2o import read_g2o_known
 from jaxreg.io.graphs.g2o_known import KnownOfGraph
+from jaxreg.io.printable import printable
 
 
 def read_known(command: Average, ids: np.ndarray, d: int) -> KnownOfGraph:
@@ -22,11 +23,22 @@ def read_known(command: Average, ids: np.ndarray, d: int) -> KnownOfGraph:
     known = KnownOfGraph([], [], [])
     if command.graph.suffix.lower() != ".log":
         known = read_g2o_known(command.graph)
+    return _with_options(known, command, ids, d)
+
+
+def read_known_scans(command: Multiview, names: list[str], d: int) -> KnownOfGraph:
+    """What the options tell of scans."""
+    return _with_options(KnownOfGraph([], [], []), command, np.array(names), d)
+
+
+def _with_options(
+    known: KnownOfGraph, command: Average | Multiview, ids: np.ndarray, d: int
+) -> KnownOfGraph:
     fixed = dict(known.fixed)
     for words in command.fix:
         name, _, pose = words.partition("=")
-        if not pose:
-            raise InputError(f"--fix {words}: wanted FRAME=POSE.")
+        if not (name and pose):
+            raise InputError(f"--fix {words}: wanted NAME=POSE.")
         frame = _frame(name, ids, f"--fix {words}")
         fixed[frame] = read_guess(pose, ("", name), d, scaled=False, of="--fix")
     control = known.control
@@ -41,11 +53,41 @@ def read_known(command: Average, ids: np.ndarray, d: int) -> KnownOfGraph:
     return told
 
 
+def of_middles(known: KnownOfGraph, middles: np.ndarray) -> KnownOfGraph:
+    """Of scans that were moved to their middles."""
+    fixed = []
+    for frame, T in known.fixed:
+        moved = np.array(T, np.float64)
+        moved[:-1, -1] += moved[:-1, :-1] @ middles[frame]
+        fixed.append((frame, moved))
+    control = [(frame, p - middles[frame], *rest) for frame, p, *rest in known.control]
+    return KnownOfGraph([], fixed, control)
+
+
+def known_of_scans(
+    known: KnownOfGraph, T_world_i: np.ndarray, trust: Any, names: list[str]
+) -> list[dict[str, Any]]:
+    """How far each control point is off, and its trust, for result.json."""
+    entries = []
+    for weight, (frame, p, q, *_) in zip(np.asarray(trust), known.control, strict=True):
+        T = T_world_i[frame]
+        off = T[:-1, :-1] @ p + T[:-1, -1] - q
+        entries.append(
+            {
+                "kind": "control",
+                "frame": names[frame],
+                "weight": float(weight),
+                "translation": float(np.linalg.norm(off)),
+            }
+        )
+    return entries
+
+
 def _frame(word: str, ids: np.ndarray, place: str) -> int:
     found = np.flatnonzero(ids.astype(str) == word.strip())
     if not len(found):
         raise InputError(
-            f"{place}: no frame {word.strip()!r}; the first are "
+            f"{place}: no {word.strip()!r}; the first are "
             f"{', '.join(map(str, ids[:5]))}."
         )
     return int(found[0])
@@ -149,6 +191,11 @@ def show_known(
                 f"Frame {ids[frame]} is held where none of its motions fits: is its "
                 "pose right?"
             )
+    show_entries(session, entries)
+
+
+def show_entries(session: Session, entries: list[dict[str, Any]]) -> None:
+    """A table of priors and control points; what is not trusted first."""
     if not entries:
         return
     table = Table(title="Priors and control points")
@@ -156,11 +203,12 @@ def show_known(
         table.add_column(name, justify="right")
     order = sorted(entries, key=lambda x: (x["weight"] > 0.5, -x["translation"]))
     for entry in order[:20]:
+        normalised = entry.get("normalised_residual")
         table.add_row(
             entry["kind"],
-            str(entry["frame"]),
+            printable(str(entry["frame"])),
             f"{entry['translation']:.4g}",
-            f"{entry['normalised_residual']:.2f}",
+            "" if normalised is None else f"{normalised:.2f}",
             "yes" if entry["weight"] > 0.5 else "no",
         )
     session.console.print(table)

@@ -12,6 +12,13 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Progress
 from jaxreg.app.cli import outputs
 from jaxreg.app.cli.inputs import Scans, check_point, load_scans, read_positions
+from jaxreg.app.cli.known import (
+    is_told,
+    known_of_scans,
+    of_middles,
+    read_known_scans,
+    show_entries,
+)
 from jaxreg.app.cli.options import Multiview, Order
 from jaxreg.app.cli.runtime import Session, key_of, method_of
 from jaxreg.app.pair_log import PairLog, Pairs
@@ -19,6 +26,7 @@ from jaxreg.app.plot.results import result_of
 from jaxreg.app.result import Result
 from jaxreg.app.versions import version
 from jaxreg.io.errors import InputError
+from jaxreg.io.graphs.g2o_known import KnownOfGraph
 from jaxreg.io.poses.stanford import read_conf
 
 
@@ -32,6 +40,7 @@ def run(command: Multiview, session: Session) -> int:
         command.check_known(scans.points[0].shape[1])
         _check_viewpoint(command.viewpoint, scans)
         located = _located(command, scans)
+        known = read_known_scans(command, scans.names, scans.points[0].shape[1])
         truth = None if command.truth is None else _read_truth(command.truth, scans)
     for note in scans.notes:
         session.console.print(note)
@@ -48,6 +57,7 @@ def run(command: Multiview, session: Session) -> int:
                 log,
                 command.viewpoint,
                 located,
+                known,
             )
     except KeyboardInterrupt as err:
         if not len(log):
@@ -118,6 +128,7 @@ def reconstruct_scans(
     log: PairLog | None = None,
     viewpoint: tuple[float, ...] | None = None,
     positions: jaxreg.ScanPositions | None = None,
+    known: KnownOfGraph | None = None,
 ) -> Result:
     """Reconstructs centred scans and moves the answer to the frames of the files.
 
@@ -125,6 +136,8 @@ def reconstruct_scans(
     """
     centred, middles = scans.centred()
     eyes = None if viewpoint is None else (viewpoint - middles).astype(centred[0].dtype)
+    known = KnownOfGraph([], [], []) if known is None else known
+    told = of_middles(known, middles)
     kept = None if log is None or log.pairs is None else log.pairs
     sol = jaxreg.reconstruct(
         centred,
@@ -133,6 +146,8 @@ def reconstruct_scans(
         order=order,
         viewpoints=eyes,
         positions=positions,
+        fixed=told.fixed,
+        control=told.control,
         previous=None if kept is None else jaxreg.RelativeMotions.kept(*kept),
         progress=progress,
         on_pairs=None if log is None else lambda m: log.add(_pairs(m)),
@@ -140,12 +155,21 @@ def reconstruct_scans(
     result = result_of(sol, scans.points, scans.names)
     # The frame of a component's first scan; that of a scan alone means nothing.
     first = np.argmax(result.component[:, None] == result.component, axis=1)
-    i, j = result.edges.T
-    return dataclasses.replace(
+    there, i, j = middles[first], *result.edges.T
+    in_world = is_told(known) and result.status != Status.DEGENERATE
+    if in_world:
+        there = np.where((result.component == 0)[:, None], 0, there)
+    T_world_i = outputs.uncentre(result.T_world_i, there, middles)
+    result = dataclasses.replace(
         result,
-        T_world_i=outputs.uncentre(result.T_world_i, middles[first], middles),
+        T_world_i=T_world_i,
         T_i_j=outputs.uncentre(result.T_i_j, middles[i], middles[j]),
     )
+    if not in_world:
+        return result
+    entries = known_of_scans(known, T_world_i, sol.prior_weight, result.names)
+    held = tuple(result.names[frame] for frame, _ in known.fixed)
+    return dataclasses.replace(result, fixed=held, known=entries)
 
 
 def _check_viewpoint(viewpoint: tuple[float, ...] | None, scans: Scans) -> None:
@@ -182,6 +206,7 @@ def report(
     """Writes the files and prints the tables; returns the exit code."""
     result = outputs.write_files(session, result, scans.points, errors, read=scans)
     outputs.show_scans(session, result)
+    show_entries(session, result.known or [])
     if not result.believed:
         return _tell_none_joined(session, result, scans)
     if errors is not None:

@@ -177,6 +177,16 @@ class Multiview(ModelOptions):
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
     ] = None
     """Lines NAME X Y [Z]: about where each scan's scanner stood; see --deviation."""
+    control: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
+    ] = None
+    """Surveyed points, rows of: scan, [point in it,] point in the world [, sigma]."""
+    fix: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="SCAN=POSE ...", help_behavior_hint="(default: none)"),
+    ] = ()
+    """Poses that stay: a file of one matrix, or its numbers in quotes."""
     resume: bool = False
     """Go on with the pairs that an interrupted run left in the output folder."""
 

@@ -92,8 +92,10 @@ def fake_reconstruct(
         progress("pairs", 1, 3)
         progress("pairs", 3, 3)
         v = len(scans)
-        middles = [np.median(CLOUD, axis=0)] * v
-        T = np.stack([shift(-middles[0]) @ T_true[i] for i in range(v)])
+        told = options.get("control", [])
+        in_world = bool(told or options.get("fixed"))
+        middle = np.zeros(3) if in_world else np.median(CLOUD, axis=0)
+        T = np.stack([shift(-middle) @ T_true[i] for i in range(v)])
         T = np.stack([T[i] @ shift(middle_of(T_true[i])) for i in range(v)])
         edges = np.array([(i, j) for i in range(v) for j in range(i + 1, v)])
         i, j = edges.T
@@ -116,6 +118,7 @@ def fake_reconstruct(
             mode=jnp.zeros(len(edges), int),
             motions=jaxreg.RelativeMotions(graph.edges, *modes),
             num_dropped=jnp.asarray(dropped),
+            prior_weight=jnp.ones(len(told)) if in_world else None,
         )
 
     monkeypatch.setattr(jaxreg, "reconstruct", reconstruct)

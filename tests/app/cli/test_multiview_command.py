@@ -102,6 +102,46 @@ def test_positions_are_those_of_the_scans_origins(
     assert "--deviation 0.0: wanted a number above zero" in capsys.readouterr().err
 
 
+def test_fixed_scans_and_control_points_are_those_of_the_files(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    poses = turned(0.7, 40.0) @ POSES
+    scans = [f"s{k}.npy" for k in range(3)]
+    for name, T in zip(scans, poses, strict=True):
+        np.save(name, seen_from(T))
+    given = fake_reconstruct(monkeypatch, poses, [True] * 3)
+    seen = np.load("s2.npy")[:3]
+    lies = seen @ poses[2, :3, :3].T + poses[2, :3, 3]
+    rows = np.concatenate([seen, lies, np.full((3, 1), 0.01)], axis=1)
+    rows = [",".join(["s2", *map(repr, row)]) for row in rows.tolist()]
+    Path("targets.csv").write_text("\n".join(["scan,x,y,z,X,Y,Z,sigma", *rows]))
+    np.savetxt("pose.txt", poses[1])
+    run = ["multiview", *scans, "--control", "targets.csv", "--fix"]
+    assert main([*run, "s1=pose.txt"]) == 0
+    (frame, T), told = given[0][2]["fixed"][0], given[0][2]["control"]
+    assert (frame, [row[0] for row in told]) == (1, [2, 2, 2])
+    # The solver gets scans about their middles, and the same world.
+    for k, own, p, q in [(1, T, 0, 0), *((2, poses[2], *row[1:3]) for row in told)]:
+        points = np.load(f"s{k}.npy")
+        if k == 1:
+            centred = given[0][0][1]
+            back = centred @ own[:3, :3].T + own[:3, 3]
+            wanted = points @ poses[1, :3, :3].T + poses[1, :3, 3]
+            np.testing.assert_allclose(back, wanted, atol=1e-5)
+        else:
+            middle = np.median(points, axis=0)
+            moved = own[:3, :3] @ (p + middle) + own[:3, 3]
+            np.testing.assert_allclose(moved, q, atol=1e-8)
+    np.testing.assert_allclose(told[0][3], np.eye(3) * 1e4)
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    np.testing.assert_allclose(found["T_world_i"], poses, rtol=0, atol=1e-4)
+    assert found["fixed"] == ["s1"]
+    assert [row["frame"] for row in found["known"]] == ["s2"] * 3
+    assert "Priors and control points" in capsys.readouterr().out
+    assert main([*run, "s7=pose.txt"]) == 2
+    assert "--fix s7=pose.txt: no 's7'; the first are s0" in capsys.readouterr().err
+
+
 def test_truth_adds_errors(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

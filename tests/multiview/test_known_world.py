@@ -1,0 +1,190 @@
+"""`reconstruct` with fixed scans, priors and control points, of a sculpture."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import motion, move, pose_error
+
+import jaxreg as jr
+from jaxreg import Status
+from jaxreg.datasets import sculpture_scans
+from jaxreg.matching import NO_EVIDENCE
+from jaxreg.multiview import RelativeMotions
+
+
+pytestmark = pytest.mark.usefixtures("fully_compiled")
+
+
+FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64)
+#: Where the world lies, seen from the sculpture.
+T_WORLD = motion(11, 3, angle=2.0, shift=3.0)
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Scans, their poses in the world, and all motions between them."""
+    scans, truth = sculpture_scans(8, seed=0, points_per_scan=3000)
+    scans = [s.astype(np.float32) for s in scans]
+    pairs = []
+    alone = jr.reconstruct(
+        scans, key=jax.random.key(0), method=FILTER, on_pairs=pairs.append
+    )
+    return scans, T_WORLD @ truth, RelativeMotions.joined(pairs), alone
+
+
+def _solve(found: Any, **told: Any) -> jr.ReconstructionSolution:
+    scans, _, pairs, _ = found
+    return jr.reconstruct(
+        scans, key=jax.random.key(0), method=FILTER, previous=pairs, **told
+    )
+
+
+def _errors(T_world_i: Any, truth: np.ndarray) -> np.ndarray:
+    pairs = zip(T_world_i, truth, strict=True)
+    return np.array([pose_error(T, T_true) for T, T_true in pairs])
+
+
+def test_scans_lie_in_the_world_of_those_that_are_fixed(found):
+    _, truth, _, alone = found
+    sol = _solve(found, fixed=[(3, truth[3]), (6, truth[6])])
+    assert int(sol.status) == Status.CONVERGED
+    np.testing.assert_array_equal(sol.T_world_i[3], truth[3].astype(np.float32))
+    errors = _errors(sol.T_world_i, truth)
+    assert errors[:, 0].max() < 0.01
+    assert errors[:, 1].max() < 0.003
+    # The surfaces lie as close as before.
+    assert np.sum(sol.edge_weight > 0.5) >= np.sum(alone.edge_weight > 0.5) - 1
+
+
+def test_wrong_priors_and_points_are_told(found):
+    scans, truth, _, _ = found
+    information = np.diag([1e4] * 3 + [1e4] * 3)
+    off = motion(5, 3, angle=0.5, shift=1.0)
+    priors = [
+        (k, truth[k] @ off if k == 2 else truth[k], information) for k in range(5)
+    ]
+    control = []
+    for n, k in enumerate([0, 2, 4, 5, 6, 7]):
+        seen = np.asarray(scans[k][n], np.float64)
+        lies = move(truth[k], seen[None])[0] + (0.7 if n == 3 else 0)
+        control.append((k, seen, lies, np.eye(3) * 1e4))
+    sol = _solve(found, priors=priors, control=control)
+    assert int(sol.status) == Status.CONVERGED
+    right = np.asarray(sol.prior_weight) > 0.5
+    np.testing.assert_array_equal(np.flatnonzero(~right), [2, 5 + 3])
+    errors = _errors(sol.T_world_i, truth)
+    assert errors[:, 0].max() < 0.01
+    assert errors[:, 1].max() < 0.003
+
+
+@pytest.fixture(scope="module")
+def halves(found):
+    """The same, but no pair joins scans 0 to 4 with 5 to 7."""
+    scans, truth, pairs, alone = found
+    across = (pairs.pairs < 5).sum(axis=1) == 1
+    told = np.where(across[:, None], np.float32(NO_EVIDENCE), pairs.log_evidence)
+    return scans, truth, eqx.tree_at(lambda p: p.log_evidence, pairs, told), alone
+
+
+def _seen(found: Any, k: int, n: int) -> tuple[int, np.ndarray, np.ndarray]:
+    seen = np.asarray(found[0][k][n : n + 1], np.float64)
+    return k, seen[0], move(found[1][k], seen)[0]
+
+
+def test_parts_meet_in_the_world(halves):
+    _, truth, _, _ = halves
+    apart = _solve(halves, fixed=[(6, truth[6])])
+    assert int(apart.status) == Status.DISCONNECTED
+    # What lies in the world comes first, though it is the smaller part.
+    np.testing.assert_array_equal(apart.placed, np.arange(8) >= 5)
+    assert _errors(apart.T_world_i, truth)[5:, 0].max() < 0.02
+    places = [(0, 0), (1, 900), (3, 1800), (4, 500), (2, 100)]
+    control = [_seen(halves, k, n) for k, n in places]
+    sol = _solve(halves, fixed=[(6, truth[6])], control=control)
+    assert int(sol.status) == Status.CONVERGED
+    errors = _errors(sol.T_world_i, truth)
+    assert errors[:, 0].max() < 0.02
+    assert errors[:, 1].max() < 0.005
+
+
+def test_a_fixed_scan_that_no_pair_has_there_is_named(found):
+    _, truth, _, _ = found
+    wrong = motion(7, 3, angle=0.8, shift=1.0)
+    fixed = [(k, truth[k] @ wrong if k == 4 else truth[k]) for k in (1, 2, 4)]
+    sol = _solve(found, fixed=fixed)
+    expected = np.where(np.arange(8) == 4, Status.NO_AGREEMENT, Status.CONVERGED)
+    np.testing.assert_array_equal(sol.scan_status, expected)
+    np.testing.assert_array_equal(sol.T_world_i[4], np.float32(fixed[2][1]))
+    others = np.delete(np.arange(8), 4)
+    assert _errors(sol.T_world_i[others], truth[others])[:, 0].max() < 0.02
+
+
+def test_points_on_a_line_hold_nothing(found):
+    scans, truth, _, alone = found
+    places = [np.array([0.1 * n, 0, 0]) for n in range(4)]
+    lie = [truth[0][:3, :3] @ p + truth[0][:3, 3] for p in places]
+    control = [(0, p, q) for p, q in zip(places, lie, strict=True)]
+    sol = _solve(found, control=control)
+    assert int(sol.status) == Status.DEGENERATE
+    np.testing.assert_allclose(sol.T_world_i, alone.T_world_i, atol=1e-5)
+
+
+def test_map_coordinates_keep_their_digits(found):
+    scans, truth, pairs, _ = found
+    middle, north = np.array([350_000.0, 5_600_000, 200]), np.array([8e5, 4.2e6, 9])
+    far = [scan.astype(np.float64) + middle for scan in scans]
+    T = truth.copy()
+    T[:, :3, 3] += north - truth[:, :3, :3] @ middle
+    moved = np.array(pairs.T_i_j, np.float64)
+    moved[..., :3, 3] += middle - moved[..., :3, :3] @ middle
+    kept = eqx.tree_at(lambda p: p.T_i_j, pairs, moved)
+    control = []
+    for k, n in [(0, 5), (4, 900), (7, 1800)]:
+        control.append((k, far[k][n], T[k][:3, :3] @ far[k][n] + T[k][:3, 3]))
+    sol = _solve((far, T, kept, None), fixed=[(2, T[2])], control=control)
+    assert sol.T_world_i.dtype == np.float64
+    np.testing.assert_array_equal(sol.T_world_i[2], T[2])
+    for points, pose, true in zip(far, sol.T_world_i, T, strict=True):
+        assert np.abs(move(pose, points) - move(true, points)).max() < 0.01
+
+
+def test_poses_follow_what_is_known(found):
+    _, truth, _, _ = found
+    turn = jnp.asarray(truth[1], jnp.float32)
+
+    def places(shift: jax.Array) -> jax.Array:
+        sol = _solve(found, priors=[(1, turn.at[:3, 3].add(shift))])
+        return sol.T_world_i[:, :3, 3]
+
+    east = jnp.array([1.0, 0, 0])
+    _, slopes = jax.jvp(places, (jnp.zeros(3),), (east,))
+    np.testing.assert_allclose(slopes, np.tile(east, (8, 1)), atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"fixed": [(8, np.eye(4))]}, r"fixed\[0\]: wanted a frame below 8, found 8"),
+        ({"priors": [(0, 2 * np.eye(4))]}, r"priors\[0\]: .*rigid"),
+        ({"control": [(0, np.zeros(3), np.zeros(3))]}, "control: wanted at least 3"),
+    ],
+)
+def test_wrong_rows_are_named(found, told, words):
+    with pytest.raises(ValueError, match=words):
+        _solve(found, **told)
+
+
+def test_poses_to_hold_are_given_as_fixed_ones(found):
+    scans, truth, _, alone = found
+    with pytest.raises(ValueError, match="hold_previous: .* as fixed="):
+        jr.reconstruct(
+            scans,
+            key=jax.random.key(0),
+            previous=alone,
+            hold_previous=True,
+            fixed=[(0, truth[0])],
+        )
