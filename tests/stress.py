@@ -2,7 +2,8 @@
 
 Every public method of `register` and `average` under `vmap`, over and over. Two batched
 calls of LAPACK in one program, which stood still on two cores, were met in most runs.
-A child that stays without a word for too long is said to hang.
+A child that takes no time of the cores for a minute is said to hang; where that cannot
+be read, one that stays without a word for ten.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from pathlib import Path
 
 
 ROOT = Path(__file__).parents[1]
-SILENCE = 600  # seconds; compiling is the longest of what is done in silence
+STILL, SILENCE = 60, 600  # seconds without time of the cores, without a word
 
 
 def _child(name: str, runs: int, batch: int) -> None:
@@ -64,17 +65,30 @@ def watched(name: str, runs: int, batch: int) -> str:
         assert child.stdout is not None
         heard = selectors.DefaultSelector()
         heard.register(child.stdout, selectors.EVENT_READ)
-        while heard.select(SILENCE):
+        used = _core_seconds(child.pid)
+        while True:
+            if not heard.select(SILENCE if used is None else STILL):
+                before, used = used, _core_seconds(child.pid)
+                if before is None or used is None or used - before < 1:
+                    child.kill()
+                    return f"HANGS after {done} runs"
+                continue
             line = child.stdout.readline()
             if not line:
                 break
             done += line.endswith(b"True\n")
-        else:
-            child.kill()
-            return f"HANGS after {done} runs"
     if child.returncode or done < runs:
         return f"FAILED after {done} runs, code {child.returncode}"
     return f"{done} runs in {time.monotonic() - begin:.0f} s"
+
+
+def _core_seconds(pid: int) -> float | None:
+    """Time of the cores that a process has used, where that can be read."""
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def main() -> int:
