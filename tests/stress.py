@@ -30,6 +30,7 @@ def _child(name: str, runs: int, batch: int) -> None:
     from protocols import AVERAGERS, KEY, REGISTRARS, graph, measured, pair
 
     import jaxreg as jr
+    from jaxreg.particle import AbstractSearch
 
     def repeated(x: jax.Array) -> jax.Array:
         noise = jax.random.normal(KEY, (batch, *x.shape), x.dtype)
@@ -37,6 +38,8 @@ def _child(name: str, runs: int, batch: int) -> None:
 
     if name in REGISTRARS:
         method = REGISTRARS[name].make(3)
+        if isinstance(method, AbstractSearch):  # of a hundred poses each
+            batch //= 8
         inputs = tuple(map(repeated, pair(3, np.float32)))
 
         def one(source: jax.Array, target: jax.Array) -> jax.Array:

@@ -129,7 +129,7 @@ def _placed(
         shown_information(graph, *held),
         is_leaf=lambda x: x is None,
     )
-    out = average_in_world(graph, averaging, _centred(known, scans), found.T_world_i)
+    out = average_in_world(graph, averaging, centred(known, scans), found.T_world_i)
     beside = out.status != Status.DEGENERATE
     joined = out.placed & beside
     root = jnp.argmax(joined).astype(jnp.int32)
@@ -163,7 +163,7 @@ def _best(
     return none.at[motions.pairs].max(trust[:, None])
 
 
-def _centred(known: Known, scans: PreparedScans) -> Known:
+def centred(known: Known, scans: PreparedScans) -> Known:
     """What is known of the centred frames, with their radius as the unit.
 
     A small motion e of a frame is `inv(S) Ad(inv(C)) e` of its centred frame, which is

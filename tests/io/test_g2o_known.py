@@ -22,7 +22,8 @@ FIX 7 12
 PARAMS_SE3OFFSET 3 0.5 0 0 0 0 0 1
 """
 TURNED = f"0 0 {np.sqrt(0.5)} {np.sqrt(0.5)}"
-NO_TURN = " ".join(map(str, np.diag([4.0, 1, 1, 0, 0, 0])[np.triu_indices(6)]))
+#: Of the position alone: x for itself, and with z.
+NO_TURN = " ".join(map(str, [4, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, *[0] * 9]))
 
 
 def read(tmp_path: Path, text: str) -> io.KnownOfGraph:
@@ -77,7 +78,9 @@ def test_positions_are_control_points(tmp_path: Path):
     np.testing.assert_allclose(W, np.diag([2.0, 3, 4]))
     np.testing.assert_allclose(p_turned, 0)
     np.testing.assert_allclose(q_turned, [1, 1, 0])
-    np.testing.assert_allclose(W_turned, np.diag([1.0, 4, 1]), atol=1e-12)
+    # What was x of the frame is y of the world.
+    turned = [[1, 0, 0], [0, 4, 1], [0, 1, 1]]
+    np.testing.assert_allclose(W_turned, turned, atol=1e-12)
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -85,7 +88,8 @@ def test_what_is_written_is_read_again(tmp_path: Path, d: int):
     X, edges, T_i_j, _ = random_graph(7, 14, 0.0, 1, d=d)
     rng = np.random.default_rng(0)
     k = 6 if d == 3 else 3
-    W = np.eye(k) + np.diag(np.arange(k))
+    W = np.eye(k) + np.diag(np.arange(k)) + 0.2 / np.add.outer(np.arange(k), [1] * k)
+    W = W + W.T
     place = np.zeros(2) if d == 2 else rng.normal(size=3)
     known = io.KnownOfGraph(
         priors=[(2, X[2], W)],

@@ -1,5 +1,6 @@
 """`reconstruct` with fixed scans, priors and control points, of a sculpture."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -12,8 +13,12 @@ from helpers import motion, move, pose_error
 import jaxreg as jr
 from jaxreg import Status
 from jaxreg.datasets import sculpture_scans
+from jaxreg.geometry import lie
+from jaxreg.graph.anchored import KnownPoses
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview import RelativeMotions
+from jaxreg.multiview.known_world import KnownWorld, centred
+from jaxreg.multiview.prepare import prepare_scans
 
 
 pytestmark = pytest.mark.usefixtures("fully_compiled")
@@ -163,6 +168,29 @@ def test_poses_follow_what_is_known(found):
     east = jnp.array([1.0, 0, 0])
     _, slopes = jax.jvp(places, (jnp.zeros(3),), (east,))
     np.testing.assert_allclose(slopes, np.tile(east, (8, 1)), atol=5e-3)
+
+
+def test_what_is_known_means_the_same_of_centred_scans():
+    rng = np.random.default_rng(0)
+    points = (3 * rng.normal(size=(2, 60, 3)) + [5, 0, 1]).astype(np.float32)
+    scans = prepare_scans(jr.ICP(), jnp.asarray(points), jnp.ones((2, 60), bool))
+    half = rng.normal(size=(6, 6))
+    W, T = half @ half.T + np.eye(6), motion(3, 3)
+    known = KnownWorld.of([(1, T, W)], None, None, jnp.asarray(points))
+    assert known is not None
+    moved = centred(dataclasses.replace(known.known, origin=None), scans).poses
+    T_off = jnp.asarray(known.known.poses.T_world_prior[0]) @ lie.exp(
+        jnp.asarray(1e-3 * rng.normal(size=6), jnp.float32)
+    )
+
+    def square(poses: KnownPoses, T_world_i: jax.Array) -> float:
+        error = lie.log(lie.inverse(poses.T_world_prior[0]) @ T_world_i)
+        return float(error @ poses.information[0] @ error)
+
+    R, t = T_off[:3, :3], T_off[:3, 3]
+    middle = lie.compose(R, (t + R @ scans.mean[1]) / scans.radius)
+    wanted = square(known.known.poses, T_off)
+    assert square(moved, middle) == pytest.approx(wanted, rel=0.02)
 
 
 @pytest.mark.parametrize(
