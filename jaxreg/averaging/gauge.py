@@ -11,6 +11,7 @@ from jaxreg._core.arrays import cast_floats
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
+from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM
 from jaxreg.averaging.unit import in_range
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
@@ -28,6 +29,18 @@ def average_graph(
     """`average` of checked arguments; frames that are not `present` are padding."""
     reduced, method, T_start, gauge = _prepared(graph, method, init)
     return _placed(method.solve(reduced, T_start, key), gauge, present)
+
+
+@control.over_devices
+def follow_graph(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"], present: Bool[Array, " v"]
+) -> AveragingSolution:
+    """Poses that `PoseGraphLM` has found, with the derivatives that they have there."""
+    reduced, method, T_start, gauge = _prepared(graph, PoseGraphLM(), T_world_i)
+    assert isinstance(method, PoseGraphLM)
+    assert T_start is not None
+    found = jnp.asarray(True), jnp.zeros((), jnp.int32), None
+    return _placed(method.solution_at(reduced, T_start, *found), gauge, present)
 
 
 class _Gauge(NamedTuple):

@@ -269,9 +269,6 @@ def _reconstructions() -> Iterator[Call]:
         "order": "any",
         "previous": None,
         "hold_previous": False,
-        "priors": [(1, np.eye(4), np.eye(6))],
-        "fixed": [(0, np.eye(4))],
-        "control": [(2, np.zeros(3), np.ones(3), np.eye(3))],
         "progress": None,
         "on_pairs": None,
     }
@@ -280,6 +277,8 @@ def _reconstructions() -> Iterator[Call]:
     places = jr.ScanPositions(np.zeros((3, 3)), antenna=np.full((3, 3), 1e6 + 1))
     far = {**good, "scans": away, "method": jr.ParticleFilter(**_SEARCH)}
     far |= {"positions": places, "viewpoints": np.full((3, 3), 1e6 - 9)}
+    far |= {"priors": [(1, np.eye(4))], "fixed": [(0, np.eye(4))]}
+    far |= {"control": [(2, np.zeros(3), np.ones(3), np.eye(3))]}
     yield Call("reconstruct far away", jr.reconstruct, far, untrue, dear=True)
     padded = {**good, "scans": np.stack([SOURCE] * 3), "mask": np.ones((3, 46), bool)}
     del padded["viewpoints"]

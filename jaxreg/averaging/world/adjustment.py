@@ -22,9 +22,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
 from jaxreg._core.status import Status
-from jaxreg._core.typing import Key, Scalar, StatusArray
+from jaxreg._core.typing import Scalar, StatusArray
 from jaxreg.averaging.base import AveragingSolution
-from jaxreg.averaging.gauge import average_graph
+from jaxreg.averaging.gauge import average_graph, follow_graph
 from jaxreg.averaging.measures import deviations, length_scale, nearest_rank
 from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM
 from jaxreg.averaging.world.points import ControlPoints
@@ -46,16 +46,26 @@ class _Minimum(NamedTuple):
     trust: Float[Array, " n"]  # in edges, priors and points, that it is by
 
 
-class _AtRest(PoseGraphLM):
-    """Poses that are at a minimum, with the derivatives that they have there."""
+class _Problem(NamedTuple):
+    """Least squares whose frame 0 is the world."""
 
-    def solve(
-        self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
-    ) -> AveragingSolution:
-        """Init itself."""
-        assert init is not None
-        done = jnp.asarray(True)
-        return self.solution_at(graph, init, done, jnp.zeros((), jnp.int32), None)
+    graph: PoseGraph
+    T_start: Float[Array, "v+1 D D"]
+    moved: Bool[Array, " v+1"]  # by it, and the world
+
+    @classmethod
+    def of(
+        cls, graph: PoseGraph, known: KnownPoses, trust: Array, T: Array, joined: Array
+    ) -> "_Problem":
+        whole = anchored(graph, known)
+        whole = eqx.tree_at(lambda g: g.weight, whole, whole.weight * trust)
+        start = jnp.concatenate([jnp.eye(graph.dim + 1, dtype=T.dtype)[None], T])
+        return cls(whole, start, jnp.append(True, joined & ~known.fixed))
+
+    def poses(self, end: AveragingSolution) -> Float[Array, "v D D"]:
+        """Of the answer; those that no trusted edge holds stay."""
+        reached = (self.moved & end.placed)[:, None, None]
+        return jnp.where(reached, end.T_world_i, self.T_start)[1:]
 
 
 class Adjustment(eqx.Module):
@@ -130,33 +140,20 @@ class Adjustment(eqx.Module):
     def _minimum(self, T: Float[Array, "v D D"], width: Scalar) -> _Minimum:
         """By the trust that the poses before give."""
         graph, known, trust = self.whole(T, width)
-        T, status = self._adjusted(graph, known, trust, T, PoseGraphLM())
-        return _Minimum(T, status, trust)
+        problem = _Problem.of(graph, known, trust, T, self.joined)
+        end = average_graph(
+            problem.graph, PoseGraphLM(), problem.T_start, None, problem.moved
+        )
+        return _Minimum(problem.poses(end), end.status, trust)
 
     def _with_gradients(self, informed: PoseGraph, at: _Minimum) -> Array:
         """The same poses, with derivatives where the trust is held."""
         graph = eqx.tree_at(lambda g: g.information, self.graph, informed.information)
         moving = eqx.tree_at(lambda a: a.graph, self, graph)
         _, known, _ = moving.whole(at.T_world_i)
-        return self._adjusted(graph, known, at.trust, at.T_world_i, _AtRest())[0]
-
-    def _adjusted(
-        self,
-        graph: PoseGraph,
-        known: KnownPoses,
-        trust: Float[Array, " n"],
-        T: Float[Array, "v D D"],
-        method: PoseGraphLM,
-    ) -> tuple[Array, StatusArray]:
-        """Poses by all of it; those that no trusted edge holds stay."""
-        whole = anchored(graph, known)
-        whole = eqx.tree_at(lambda g: g.weight, whole, whole.weight * trust)
-        start = jnp.concatenate([jnp.eye(graph.dim + 1, dtype=T.dtype)[None], T])
-        moved = self.joined & ~known.fixed
-        present = jnp.append(True, moved)
-        end = average_graph(whole, method, start, None, present)
-        reached = (moved & end.placed[1:])[:, None, None]
-        return jnp.where(reached, end.T_world_i[1:], T), end.status
+        problem = _Problem.of(graph, known, at.trust, at.T_world_i, self.joined)
+        end = follow_graph(problem.graph, problem.T_start, problem.moved)
+        return problem.poses(end)
 
     def _edge_trust(self) -> Float[Array, " e"]:
         """What is left of wrong edges would widen the noise."""
