@@ -11,7 +11,7 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array
 
 from jaxreg._core.adjoint import AbstractAdjoint, ImplicitAdjoint
 from jaxreg._core.arrays import cast_floats, traced
@@ -25,7 +25,6 @@ from jaxreg._core.checks import (
     check_positive,
 )
 from jaxreg._core.loop import iterate
-from jaxreg._core.status import Status
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import (
     PointCloud,
@@ -36,12 +35,11 @@ from jaxreg.cloud import (
 from jaxreg.geometry import lie
 from jaxreg.local.curvature import Curvature, is_degenerate
 from jaxreg.local.descent import Descending, Descent, Limits
-from jaxreg.local.implicit import Rest, at_rest
+from jaxreg.local.ended import evidence_at, fits_worse, settled, status_of
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.scale import first_guess
 from jaxreg.local.steps import AbstractStep, GaussNewton
-from jaxreg.matching.evidence import LIKELY, Evidence, Witness
-from jaxreg.matching.problem import Match, Problem, match
+from jaxreg.matching.problem import Problem, match
 from jaxreg.matching.residuals import AbstractResidual, PlaneToPlane
 from jaxreg.matching.soft import SoftMatches
 from jaxreg.neighbours import (
@@ -209,20 +207,22 @@ class ICP(AbstractRegistrar):
         end = ended.state
         T, scale = end.T, end.scale
         if isinstance(self.adjoint, ImplicitAdjoint):
-            T, scale = _settled(optimiser, problem, limits, end)
+            T, scale = settled(optimiser, problem, limits, end)
 
         scaled, width = problem.scaled(end.scale), end.width
         found = match(scaled, end.T_matched, end.row, width=width)
         found = found.within(limits.farthest)
         frozen, frozen_found = lax.stop_gradient((problem, found))
         weight = lax.stop_gradient(optimiser.weights(frozen_found, end.width))
-        worse = self._worse_than(lax.stop_gradient(end), frozen, frozen_found, limits)
+        worse = fits_worse(
+            self.kernel, lax.stop_gradient(end), frozen, frozen_found, limits
+        )
         T = jnp.where(worse, init, T)
         scale = jnp.where(worse, start_scale, scale)
-        evidence = _evidence(source, target, T, scale)
+        evidence = evidence_at(source, target, T, scale)
         free = is_degenerate(self.residual, frozen_found, weight)
         T = lie.compose(scale * lie.rotation(T), lie.translation(T))
-        status = _status(T, ended.status, free, evidence, worse)
+        status = status_of(T, ended.status, free, evidence, worse)
         curvature = Curvature.of(
             optimiser, problem.scaled(scale), end.T_matched, found, end.width
         )
@@ -272,74 +272,3 @@ class ICP(AbstractRegistrar):
         if self.index is None:
             return index_within(cloud.points, cloud.mask, spacing)
         return self.index.build(cloud.points, cloud.mask)
-
-    def _worse_than(
-        self, end: Descent, problem: Problem, found: Match, limits: Limits
-    ) -> Bool[Array, ""]:
-        """Whether the guess fits better than the match at the end, beyond chance."""
-        every = limits.stride(found.mask.shape[0])
-        mask = problem.every(every).source_mask
-        # A guess that fits exactly is not better than an end that fits up to rounding.
-        rounding = (256 * jnp.finfo(end.width.dtype).eps) ** 2
-
-        def loss(sq_residual: Array) -> Array:
-            sq = jnp.minimum(sq_residual + rounding, limits.farthest**2)
-            return jnp.sum(jnp.where(mask, self.kernel.rho(sq, end.width), 0))
-
-        last = found.sq_residual[::every]
-        # Near the solution matches are exchanged: the sum is known to its standard
-        # error, and a guess is not worth more than an end within that.
-        chance = lax.rsqrt(jnp.maximum(jnp.sum(mask), 1).astype(end.width.dtype))
-        return loss(end.first_sq_residual[: len(last)]) < (1 - chance) * loss(last)
-
-
-def _settled(
-    optimiser: LocalOptimiser, problem: Problem, limits: Limits, end: Descent
-) -> tuple[Motion, Scalar]:
-    """The pose and scale at the end, with their derivatives."""
-    end = lax.stop_gradient(end)
-    scaled = problem.scaled(end.scale)
-    found = match(scaled, end.T, end.row, width=end.width).within(limits.farthest)
-    wide = optimiser.kernel.width_of(found.sq_residual, found.mask)
-    follows = (end.width > limits.floor) & (wide > 0)
-    share = jnp.where(follows, end.width / jnp.where(follows, wide, 1), 0)
-    farthest, share = lax.stop_gradient((limits.farthest, share))
-    rest = Rest(
-        optimiser=optimiser,
-        problem=problem,
-        width=jnp.where(follows, end.width, limits.floor),
-        T=end.T,
-        row=end.row,
-        scale=end.scale if limits.with_scale else None,
-        farthest=farthest,
-        follows=share,
-    )
-    T, scale = at_rest(rest)
-    return T, end.scale if scale is None else scale
-
-
-def _evidence(
-    source: PointCloud, target: PointCloud, T: Motion, scale: Scalar
-) -> Evidence:
-    """Of the source times a scale at a pose."""
-    source, target, T, scale = lax.stop_gradient((source, target, T, scale))
-    source = eqx.tree_at(lambda c: c.points, source, scale * source.points)
-    return Witness.of_some(source, target).of_pose(T)
-
-
-def _status(
-    T: Motion,
-    status: Int[Array, ""],
-    free: Bool[Array, ""],
-    evidence: Evidence,
-    worse: Bool[Array, ""],
-) -> Int[Array, ""]:
-    """Of the answer `T`, from that of the loop; the most serious last."""
-    status = jnp.where(free, Status.DEGENERATE, status)
-    # Steps that have run out say so first: more of them may find evidence.
-    unlikely = evidence.log_evidence < LIKELY
-    unlikely &= (status != Status.MAX_STEPS) | (evidence.overlap == 0)
-    status = jnp.where(unlikely, Status.LOW_OVERLAP, status)
-    status = jnp.where(worse, Status.DIVERGED, status)
-    status = jnp.where(jnp.all(jnp.isfinite(T)), status, Status.NON_FINITE)
-    return status.astype(jnp.int32)
