@@ -3,7 +3,6 @@
 Libraries are imported where they are used: a scan needs no JAX, a graph no k-d tree.
 """
 
-import collections
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,12 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxreg.io.files import text_lines
+from jaxreg.io.errors import InputError
+from jaxreg.io.graphs.g2o_file import KINDS, parse
 from jaxreg.io.points.columns import COLORS, NORMALS, named
 from jaxreg.io.points.read import NamedPoints, read_named
 
 
 _MAX_POINTS = 5_000_000
+_FEW = 2000
 GRAPHS = (".g2o", ".g2o.gz", ".graph")
 
 
@@ -135,8 +136,6 @@ def _spacing(points: np.ndarray, parts: int = 5, size: int = 40_000) -> float | 
 
     The queries lie in the middle of a slice, so that their neighbours lie in it too.
     """
-    from scipy.spatial import KDTree
-
     if len(points) < 2:
         return None
     order = np.argsort(points[:, np.argmax(np.ptp(points, axis=0))])
@@ -153,8 +152,21 @@ def _spacing(points: np.ndarray, parts: int = 5, size: int = 40_000) -> float | 
         queries = middle[:: max(1, len(middle) * len(slices) // 4000)]
         distinct = np.unique(part, axis=0)
         if len(distinct) > 1:
-            found.append(KDTree(distinct).query(queries, k=2)[0][:, 1])
+            found.append(_next_nearest(queries, distinct))
     return float(np.median(np.concatenate(found))) if found else None
+
+
+def _next_nearest(queries: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distances to the nearest but one, the queries being among the points."""
+    if len(points) > _FEW:
+        from scipy.spatial import KDTree
+
+        return KDTree(points).query(queries, k=2)[0][:, 1]
+    # By hand: what a small file holds is told before SciPy has been imported.
+    sq = np.zeros((len(queries), len(points)))
+    for a, b in zip(queries.T, points.T, strict=True):
+        sq += (a[:, None] - b) ** 2
+    return np.sqrt(np.partition(sq, 1, axis=1)[:, 1])
 
 
 def _hint(low: np.ndarray, high: np.ndarray, spacing: float, dtype: np.dtype) -> str:
@@ -178,26 +190,21 @@ def _hint(low: np.ndarray, high: np.ndarray, spacing: float, dtype: np.dtype) ->
 
 
 def _graph(path: Path) -> GraphFacts:
-    from jaxreg.io.graphs import g2o
-    from jaxreg.io.graphs.toro import read_toro
+    if path.suffix == ".graph":
+        from jaxreg.io.graphs.toro import read_toro
 
+        graph = read_toro(path)
+        return GraphFacts(graph.num_poses, graph.num_edges, graph.dim, False, {})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it counts the lines that are counted below
-        if path.suffix == ".graph":
-            graph, poses, kinds = read_toro(path), None, None
-        else:
-            graph, kinds = g2o.read_g2o(path), g2o.KINDS
-            _, poses = g2o.read_g2o_poses(path)
+        file = parse(path)
+    if not len(file.edges.line):
+        raise InputError(f"{path}: holds no EDGE_SE2 or EDGE_SE3:QUAT line.")
+    counts = {tag: len(rows) for tag, rows in file.lines.found.items()}
     return GraphFacts(
-        num_poses=graph.num_poses,
-        num_edges=graph.num_edges,
-        dim=graph.dim,
-        has_initial_poses=poses is not None,
-        unknown_lines={} if kinds is None else _unknown_lines(path, kinds),
+        num_poses=len(file.ids),
+        num_edges=len(file.edges.line),
+        dim=file.dim,
+        has_initial_poses=file.places() is not None,
+        unknown_lines={tag: n for tag, n in counts.items() if n and tag not in KINDS},
     )
-
-
-def _unknown_lines(path: Path, kinds: Sequence[str]) -> dict[str, int]:
-    words = (line.split(maxsplit=1)[:1] for _, line in text_lines(path))
-    tags = collections.Counter(w[0] for w in words if w and w[0][0] != "#")
-    return {tag: num for tag, num in tags.items() if tag not in kinds}

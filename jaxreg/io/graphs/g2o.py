@@ -6,9 +6,7 @@ the rotational part is taken to be that of the rotation vector.
 """
 
 import gzip
-import warnings
 from pathlib import Path
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,23 +19,10 @@ from jaxreg.graph.edge_checks import EdgeError, check_information, check_weights
 from jaxreg.graph.pose_graph import PoseGraph, check_graph
 from jaxreg.io.atomic import atomic_write
 from jaxreg.io.errors import InputError
-from jaxreg.io.graphs.g2o_known import KINDS as KNOWN
+from jaxreg.io.graphs.g2o_file import EDGE, VERTEX, parse
 from jaxreg.io.graphs.g2o_known import KnownOfGraph, known_lines, known_of
-from jaxreg.io.graphs.g2o_lines import Lines, Rows, columns, lines_of, motions
+from jaxreg.io.graphs.g2o_lines import columns, lines_of, motions
 from jaxreg.io.graphs.information import nearest_semidefinite
-
-
-_VERTEX = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
-_EDGE = {"EDGE_SE2": 9, "EDGE_SE3:QUAT": 28}
-KINDS = (*_VERTEX, *_EDGE, *KNOWN, "FIX")
-
-
-class _File(NamedTuple):
-    lines: Lines
-    ids: np.ndarray
-    vertices: Rows
-    edges: Rows
-    dim: int
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
@@ -57,7 +42,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
         InputError: for a file that cannot be read or a line that makes no sense, which
             the message names.
     """
-    file = _parse(Path(path))
+    file = parse(Path(path))
     if not len(file.edges.line):
         raise InputError(f"{path}: holds no EDGE_SE2 or EDGE_SE3:QUAT line.")
     d = file.dim
@@ -93,12 +78,10 @@ def read_g2o_poses(
     Raises:
         InputError: as `read_g2o`.
     """
-    file = _parse(Path(path))
+    file = parse(Path(path))
     T = motions(file.vertices, file.dim, path)
-    where = np.searchsorted(file.ids, file.vertices.ids[:, 0])
-    if len(np.unique(where)) != len(where):
-        raise InputError(f"{path}: a vertex id occurs twice.")
-    if len(where) != len(file.ids):
+    where = file.places()
+    if where is None:
         return file.ids, None
     poses = np.empty_like(T)
     poses[where] = T
@@ -117,7 +100,7 @@ def read_g2o_known(path: str | Path) -> KnownOfGraph:
     Raises:
         InputError: as `read_g2o`; for ids and parameters that the file does not have.
     """
-    file = _parse(Path(path))
+    file = parse(Path(path))
     return known_of(file.lines, file.ids, file.vertices, file.dim)
 
 
@@ -167,7 +150,7 @@ def write_g2o(
                 f"T_world_i: wanted shape {(num, d + 1, d + 1)}, found {poses.shape}."
             )
         check_rigid(poses, "T_world_i")
-        lines += lines_of(list(_VERTEX)[d - 2], names[:, None], columns(poses), digits)
+        lines += lines_of(list(VERTEX)[d - 2], names[:, None], columns(poses), digits)
     keep = np.asarray(graph.mask)
     k = lie.tangent_dim(d)
     weight = np.asarray(graph.weight, dtype=np.float64)[keep, None, None]
@@ -180,7 +163,7 @@ def write_g2o(
     motions = columns(T_i_j)
     values = np.concatenate([motions, upper], axis=1)
     lines += lines_of(
-        list(_EDGE)[d - 2], names[np.asarray(graph.edges)[keep]], values, digits
+        list(EDGE)[d - 2], names[np.asarray(graph.edges)[keep]], values, digits
     )
     if known is not None:
         lines += known_lines(known, names, d, digits)
@@ -188,27 +171,3 @@ def write_g2o(
     with atomic_write(path, "wb") as file:
         data = text.encode()
         file.write(gzip.compress(data) if Path(path).suffix == ".gz" else data)
-
-
-def _parse(path: Path) -> _File:
-    lines = Lines(path)
-    found = lines.found
-    dims = [d for d in (2, 3) if any(f"SE{d}" in tag for tag in found)]
-    if len(dims) != 1:
-        what = "2D and 3D lines in one file" if dims else "no SE2 or SE3 line"
-        raise InputError(
-            f"{path}: {what}; this is no pose graph.\n"
-            "Give a g2o file of one dimension; scans go to: jaxreg multiview"
-        )
-    unknown = {tag: len(rows) for tag, rows in found.items() if tag not in KINDS}
-    if unknown:
-        counts = ", ".join(f"{n} x {tag}" for tag, n in unknown.items())
-        warnings.warn(
-            f"{path}: skipped lines of unknown kinds ({counts}).", stacklevel=3
-        )
-    d = dims[0]
-    vertex, edge = list(_VERTEX)[d - 2], list(_EDGE)[d - 2]
-    vertices = lines.rows(vertex, 1, _VERTEX[vertex])
-    edges = lines.rows(edge, 2, _EDGE[edge])
-    ids = np.unique(np.concatenate([vertices.ids.ravel(), edges.ids.ravel()]))
-    return _File(lines, ids, vertices, edges, d)

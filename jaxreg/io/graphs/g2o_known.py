@@ -15,17 +15,8 @@ import numpy as np
 from jaxreg._core.checks import check_rigid
 from jaxreg.geometry import lie
 from jaxreg.io.errors import InputError
+from jaxreg.io.graphs.g2o_file import KNOWN
 from jaxreg.io.graphs.g2o_lines import Lines, Rows, columns, lines_of, motions
-
-
-#: Numbers after the ids of each kind of line, and how many ids there are.
-KINDS = {
-    "PARAMS_SE3OFFSET": (1, 7),
-    "EDGE_PRIOR_SE2": (1, 9),
-    "EDGE_PRIOR_SE2_XY": (1, 5),
-    "EDGE_SE3_PRIOR": (2, 28),
-    "EDGE_SE3_XYZPRIOR": (2, 9),
-}
 
 
 class KnownOfGraph(NamedTuple):
@@ -46,7 +37,7 @@ def known_of(lines: Lines, ids: np.ndarray, vertices: Rows, d: int) -> KnownOfGr
     """Reads them; frames are places in `ids`."""
     offsets = {}
     if d == 3:
-        rows = lines.rows("PARAMS_SE3OFFSET", *KINDS["PARAMS_SE3OFFSET"])
+        rows = lines.rows("PARAMS_SE3OFFSET", *KNOWN["PARAMS_SE3OFFSET"])
         each = motions(rows, 3, lines.path)
         offsets = dict(zip(rows.ids[:, 0].tolist(), each, strict=True))
     priors, control = [], []
@@ -71,7 +62,7 @@ def _each(
     lines: Lines, tag: str, ids: np.ndarray, offsets: dict[int, np.ndarray], d: int
 ) -> list[tuple[int, np.ndarray, Rows, int]]:
     """Frame and sensor of each line of a kind, and where its numbers are."""
-    rows = lines.rows(tag, *KINDS[tag])
+    rows = lines.rows(tag, *KNOWN[tag])
     out = []
     for n, (line, own) in enumerate(zip(rows.line, rows.ids.tolist(), strict=True)):
         frame = int(np.searchsorted(ids, own[0]))

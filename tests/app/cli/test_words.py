@@ -184,14 +184,16 @@ def test_without_plotly_the_other_files_are_written(
     assert "report.html" not in said.split("Written to")[1]
 
 
-def test_help_and_facts_of_a_scan_load_no_jax(folder: Path):
+def test_help_and_facts_of_files_load_no_jax(folder: Path):
     np.save(folder / "scan.npy", CLOUD)
-    for words in (["--help"], ["register", "--help"], ["info", "scan.npy"]):
+    (folder / "a.g2o").write_text(GRAPH)
+    facts = ["info", "scan.npy"], ["info", "a.g2o"]
+    for words in (["--help"], ["register", "--help"], *facts):
         code = (
             "import contextlib, sys\n"
             "from jaxreg.app.cli.main import main\n"
             f"with contextlib.suppress(SystemExit): main({words})\n"
-            "assert not {'jax', 'equinox', 'matplotlib'} & set(sys.modules)"
+            "assert not {'jax', 'scipy', 'matplotlib'} & set(sys.modules)"
         )
         done = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True
