@@ -1,7 +1,9 @@
 """`edge_report`: what an adjustment says of each motion, in the terms of surveyors."""
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -120,19 +122,14 @@ def edge_report(
         sound: np.ndarray = np.asarray(finite)
         usable = np.asarray(graph.mask) & (np.asarray(graph.weight) > 0) & sound
         trusted = given & usable
-        share = jnp.asarray(trusted, jnp.float64)
         held = np.unique(np.append(np.asarray(graph.edges)[trusted], 0))
-        noise = deviations(wide, T, share)
-        Omega = precisions(wide, jnp.ones_like(share), noise)
-        if wide.information is None:
-            Omega = Omega / noise[1] ** 2
-        r = np.where(sound[:, None], np.asarray(wide.tangent_errors(T)), np.nan)
-        weights = np.asarray(Omega)
-        k, ranks = r.shape[1], _ranks(weights)
-        redundancy = np.full(len(r), np.nan)
-        if graph.num_poses * k <= max_unknowns:
-            W = jnp.where(trusted[:, None, None], Omega, 0)
-            redundancy = np.where(trusted, _redundancy(wide, T, W, ranks, held), 1.0)
+        few = graph.num_poses * lie.tangent_dim(graph.dim) <= max_unknowns
+        at = jax.tree.map(np.asarray, _linearised(wide, T, jnp.asarray(trusted), few))
+    r, weights = np.where(sound[:, None], at.residual, np.nan), at.information
+    k, ranks = r.shape[1], _ranks(weights)
+    redundancy = np.full(len(r), np.nan)
+    if at.normal is not None:
+        redundancy = np.where(trusted, _redundancy(at, graph, ranks, held), 1.0)
     square = np.einsum("ea,eab,eb->e", r, weights, r)
     spare = int(ranks[trusted].sum()) - k * (len(held) - 1)
     total = float(square[trusted].sum())
@@ -163,15 +160,41 @@ def _ranks(Omega: np.ndarray) -> np.ndarray:
     return np.sum(sizes > 1e-9 * sizes[:, -1:], axis=1)
 
 
+class _Linearised(NamedTuple):
+    """The adjustment at its poses, arrays of float64."""
+
+    residual: Any  # (e, k)
+    information: Any  # (e, k, k) of each edge
+    trusted: Any  # (e, k, k) of those that are trusted, else 0
+    by_first: Any  # (e, k, k) the error of an edge by the tangent of its first frame
+    normal: Any  # (v k, v k), None of many frames
+
+
+@eqx.filter_jit
+def _linearised(
+    graph: PoseGraph, T: jax.Array, trusted: jax.Array, few: bool
+) -> _Linearised:
+    share = trusted.astype(T.dtype)
+    noise = deviations(graph, T, share)
+    Omega = precisions(graph, jnp.ones_like(share), noise)
+    if graph.information is None:
+        Omega = Omega / noise[1] ** 2
+    W = jnp.where(trusted[:, None, None], Omega, 0)
+    i, j = graph.edges[:, 0], graph.edges[:, 1]
+    J = -lie.adjoint(product(lie.inverse(T)[j], T[i]))
+    H = normal_equations(graph, T, W)[0] if few else None
+    return _Linearised(graph.tangent_errors(T), Omega, W, J, H)
+
+
 def _redundancy(
-    graph: PoseGraph, T: jax.Array, W: jax.Array, ranks: np.ndarray, held: np.ndarray
+    at: _Linearised, graph: PoseGraph, ranks: np.ndarray, held: np.ndarray
 ) -> np.ndarray:
     """`(e,)` 1 less the mean of W A inv(A' W A) A' over each edge's components A.
 
     `held` are the frames that trusted edges hold, and the others no unknowns.
     """
-    num, k = graph.num_poses, W.shape[-1]
-    H = np.array(normal_equations(graph, T, W)[0])
+    num, k = graph.num_poses, at.residual.shape[-1]
+    H = np.array(at.normal)
     idle = np.setdiff1d(np.arange(num), held)[:, None] * k + np.arange(k)
     H[idle, idle] = 1
     try:
@@ -180,9 +203,9 @@ def _redundancy(
         return np.full(len(graph.edges), np.nan)
     C[0], C[:, 0] = 0, 0
     i, j = np.asarray(graph.edges).T
-    J = -np.asarray(lie.adjoint(product(lie.inverse(T)[j], T[i])))
+    J = at.by_first
     Jt = J.swapaxes(1, 2)
     cross = J @ C[i, j]
     covariance = J @ C[i, i] @ Jt + cross + cross.swapaxes(1, 2) + C[j, j]
-    explained = np.einsum("eab,eba->e", np.asarray(W), covariance)
+    explained = np.einsum("eab,eba->e", at.trusted, covariance)
     return 1 - explained / np.maximum(ranks, 1)
