@@ -7,7 +7,7 @@ import jax
 
 
 # Programs that compile in less are compiled again: reading one takes a tenth of this.
-_LEAST_SECONDS = 0.2
+_LEAST_SECONDS = 0.05
 
 
 def cache(folder: str | Path | None = None) -> Path:
