@@ -167,10 +167,10 @@ def _objective(graph: PoseGraph, answer: dict[str, Any]) -> float:
 
 
 def _times(answers: list[Any]) -> list[Metric]:
-    """As the commands report them: what compiling took, and computing alone."""
+    """As the commands report them: what making programs took, and computing alone."""
     times = [answer["times_s"] for answer in answers]
     return [
-        Metric(key, float(np.median([t[key] for t in times])), "s", "down")
-        for key in ("compile", "run")
-        if key in times[0]
+        Metric(key, float(np.median([t.get(key, 0) for t in times])), "s", "down")
+        for key in ("trace", "load", "compile", "run")
+        if any(key in t for t in times)
     ]

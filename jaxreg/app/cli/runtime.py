@@ -6,7 +6,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 from rich.console import Console
@@ -87,14 +87,15 @@ class Session:
 
     @contextlib.contextmanager
     def timed(self, part: str, computes: bool = False) -> Iterator[None]:
-        """Adds the seconds of the block; compilation is told apart if it `computes`."""
-        compiled, start = _COMPILE_CLOCK.seconds, time.perf_counter()
+        """Adds the seconds of the block, those of programs apart if it `computes`."""
+        start = time.perf_counter()
         yield
         total = time.perf_counter() - start
         if computes:
-            compiling = min(_COMPILE_CLOCK.seconds - compiled, total)
-            self.times["compile"] = self.times.get("compile", 0.0) + compiling
-            total -= compiling
+            for kind, seconds in _CLOCK.seconds(start).items():
+                seconds = min(seconds, total)
+                self.times[kind] = self.times.get(kind, 0.0) + seconds
+                total -= seconds
         self.times[part] = self.times.get(part, 0.0) + total
 
     @contextlib.contextmanager
@@ -167,22 +168,41 @@ def _told_once(show: Callable[..., None]) -> Callable[..., None]:
     return once
 
 
-class _CompileClock:
-    """Seconds that JAX spent tracing, lowering and compiling in this process."""
+class Clock:
+    """Seconds in which JAX made programs: traced, loaded and compiled them.
 
-    _EVENTS = (
-        "/jax/core/compile/jaxpr_trace_duration",
-        "/jax/core/compile/jaxpr_to_mlir_module_duration",
-        "/jax/core/compile/backend_compile_duration",
-    )
+    Tracing is what each start repeats, loading is from the folder of kept programs.
+    """
+
+    _EVENTS: ClassVar = {
+        "/jax/core/compile/jaxpr_trace_duration": "trace",
+        "/jax/core/compile/jaxpr_to_mlir_module_duration": "trace",
+        "/jax/compilation_cache/cache_retrieval_time_sec": "load",
+        "/jax/core/compile/backend_compile_duration": "compile",
+    }
 
     def __init__(self) -> None:
-        self.seconds = 0.0
-        jax.monitoring.register_event_duration_secs_listener(self._hear)
+        self._parts: list[tuple[float, float, str]] = []
+        jax.monitoring.register_event_duration_secs_listener(self.hear)
 
-    def _hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event in self._EVENTS:
-            self.seconds += duration_secs
+    def hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        """An event of JAX that has just ended."""
+        if event not in self._EVENTS:
+            return
+        kind, start = self._EVENTS[event], time.perf_counter() - duration_secs
+        # What began within it is part of it.
+        while self._parts and self._parts[-1][0] >= start:
+            if self._parts.pop()[2] == "load" and kind == "compile":
+                kind = "load"
+        self._parts.append((start, duration_secs, kind))
+
+    def seconds(self, since: float) -> dict[str, float]:
+        """By kind, of what began since then; of kinds that took any."""
+        out: dict[str, float] = {}
+        for start, seconds, kind in self._parts:
+            if start >= since:
+                out[kind] = out.get(kind, 0.0) + seconds
+        return {kind: out[kind] for kind in ("trace", "load", "compile") if kind in out}
 
 
-_COMPILE_CLOCK = _CompileClock()
+_CLOCK = Clock()

@@ -3,13 +3,15 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 import jaxreg
-from jaxreg.app.cli.runtime import keep_compiled_programs
+from jaxreg.app.cli.runtime import Clock, keep_compiled_programs
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="modes of files")
@@ -94,3 +96,23 @@ def test_a_cache_that_cannot_be_made_is_done_without(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     keep_compiled_programs()
     assert used == {}
+
+
+def test_programs_are_counted_once_by_how_they_were_made():
+    clock = Clock()
+    lower, trace = "jaxpr_to_mlir_module_duration", "jaxpr_trace_duration"
+    compiled = "/jax/core/compile/backend_compile_duration"
+    for event, seconds in [
+        (f"/jax/core/compile/{trace}", 1.0),  # of a function within the next
+        (f"/jax/core/compile/{trace}", 30.0),
+        ("/jax/another/event", 100.0),
+        (f"/jax/core/compile/{lower}", 1e-7),
+        ("/jax/compilation_cache/cache_retrieval_time_sec", 1e-7),
+        (compiled, 2e-5),  # read, not compiled
+    ]:
+        clock.hear(event, seconds)
+    found = clock.seconds(since=-np.inf)
+    assert found == {"trace": pytest.approx(30, abs=1e-3), "load": 2e-5}
+    clock.hear(compiled, 1e-9)
+    assert clock.seconds(since=-np.inf)["compile"] == 1e-9
+    assert clock.seconds(since=time.perf_counter()) == {}
