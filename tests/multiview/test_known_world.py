@@ -185,6 +185,7 @@ def test_what_is_known_means_the_same_of_centred_scans():
 
     def square(poses: KnownPoses, T_world_i: jax.Array) -> float:
         error = lie.log(lie.inverse(poses.T_world_prior[0]) @ T_world_i)
+        assert poses.information is not None
         return float(error @ poses.information[0] @ error)
 
     R, t = T_off[:3, :3], T_off[:3, 3]
