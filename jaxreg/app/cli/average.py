@@ -12,6 +12,7 @@ from rich.table import Table
 from jaxreg._core.status import Status
 from jaxreg.app.advice import terminal_advice
 from jaxreg.app.cli import outputs
+from jaxreg.app.cli.by_hand import forced, left_out, motions_between, pairs_of
 from jaxreg.app.cli.known import (
     is_told,
     known_entries,
@@ -64,6 +65,9 @@ def run(command: Average, session: Session) -> int:
         warnings.simplefilter("always")
         graph, ids = _read(command.graph)
         known = read_known(command, ids, graph.dim)
+        dropped = motions_between(command.drop, graph, ids, "--drop")
+        right = motions_between(command.force, graph, ids, "--force")
+    graph = left_out(graph, dropped)
     for message in {str(w.message) for w in caught}:
         session.console.print(message)
     key = key_of(command)
@@ -72,6 +76,8 @@ def run(command: Average, session: Session) -> int:
         before = average(graph, method=ShortestPaths())
         progress("averaging", 1, 2)
         sol = average(graph, method=method, key=key, **known._asdict())
+        if right.any():
+            sol = forced(graph, sol, right, known._asdict())
         jax.block_until_ready(sol)
         progress("averaging", 2, 2)
     if is_told(known):
@@ -79,7 +85,10 @@ def run(command: Average, session: Session) -> int:
     objective = [float(chordal_objective(graph, s.T_world_i)) for s in (before, sol)]
     report = edge_report(graph, sol, **known._asdict())
     entries = known_entries(known, sol, report, ids)
-    _write(session, graph, before, sol, ids, objective, report, known, entries)
+    by_hand = {"dropped": pairs_of(graph, dropped, ids)} if dropped.any() else {}
+    by_hand |= {"forced": pairs_of(graph, right, ids)} if right.any() else {}
+    told = known, entries, by_hand
+    _write(session, graph, before, sol, ids, objective, report, told)
     _show(session, graph, sol, objective)
     show_known(session, entries, known, report, ids)
     _show_residuals(session, report, ids)
@@ -111,9 +120,9 @@ def _write(
     ids: np.ndarray,
     objective: list[float],
     report: EdgeReport,
-    known: KnownOfGraph,
-    entries: list[dict[str, Any]],
+    told: tuple[KnownOfGraph, list[dict[str, Any]], dict[str, Any]],
 ) -> None:
+    known, entries, by_hand = told
     with result_folder(session.options.out) as staging:
         with session.timed("write"):
             figure = draw_graph(
@@ -132,6 +141,7 @@ def _write(
                 timestamps=ids[placed],
             )
         document = _document(sol, ids, objective) | _adjusted(graph, sol, ids, report)
+        document |= by_hand
         if is_told(known):
             document["fixed"] = [int(ids[frame]) for frame, _ in known.fixed]
             document["known"] = entries

@@ -218,6 +218,16 @@ class Average(Options):
         tyro.conf.arg(metavar="FRAME=POSE ...", help_behavior_hint="(default: none)"),
     ] = ()
     """Poses that stay: a file of one matrix, or its numbers in quotes."""
+    drop: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="I,J ...", help_behavior_hint="(default: none)"),
+    ] = ()
+    """Motions between these frames are left out."""
+    force: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="I,J ...", help_behavior_hint="(default: none)"),
+    ] = ()
+    """Motions between these frames are right, whatever the others say."""
 
 
 @dataclass(frozen=True)

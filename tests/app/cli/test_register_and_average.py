@@ -241,6 +241,46 @@ def test_average_goes_into_the_frame_of_what_is_known(
     assert [frame for frame, _ in again.fixed] == [1]
 
 
+def test_motions_are_left_out_and_forced_by_hand(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A square with both diagonals, and a step that says twice its length."""
+    places = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    lines = [f"VERTEX_SE2 {k} {x} {y} 0" for k, (x, y) in enumerate(places)]
+    info = "400 0 0 400 0 400"
+    for i, j in ((0, 1), (1, 2), (2, 3), (0, 3), (0, 2), (1, 3)):
+        x, y = (places[j] - places[i]) * (2 if (i, j) == (2, 3) else 1)
+        lines.append(f"EDGE_SE2 {i} {j} {x} {y} 0 {info}")
+    (folder / "g.g2o").write_text("\n".join(lines) + "\n")
+
+    def averaged(*words: str) -> tuple[dict[str, Any], np.ndarray]:
+        assert main(["average", "g.g2o", *words]) == 0
+        found = json.loads(Path("jaxreg-out/result.json").read_text())
+        return found, np.array(found["T_world_i"])[:, :2, 2]
+
+    found, where = averaged()
+    np.testing.assert_allclose(where, places, atol=1e-4)
+    assert [e["weight"] > 0.5 for e in found["edges"]] == [True, True, False] + 3 * [
+        True
+    ]
+    found, where = averaged("--force", "3,2")
+    assert found["forced"] == [[2, 3]]
+    assert found["edges"][2]["weight"] == 1
+    # Each of the motions about it gives way.
+    assert 0.2 < np.linalg.norm(where[3] - places[3]) < 0.8
+    found, where = averaged("--drop", "2,3", "0, 3", "--quiet")
+    assert found["dropped"] == [[2, 3], [0, 3]]
+    assert [e["weight"] for e in found["edges"]][2:4] == [0, 0]
+    np.testing.assert_allclose(where, places, atol=1e-4)
+    capsys.readouterr()
+    for words, said in [
+        (["--drop", "0,9"], "--drop 0,9: no motion between these two"),
+        (["--force", "2"], "--force 2: wanted two frames as I,J"),
+    ]:
+        assert main(["average", "g.g2o", *words]) == 2
+        assert said in capsys.readouterr().err
+
+
 def test_average_reads_the_motions_of_fragments(folder: Path):
     edges = [(0, 1), (1, 2), (0, 2)]
     T = [np.linalg.inv(POSES[i]) @ POSES[j] for i, j in edges]
