@@ -212,11 +212,9 @@ class ICP(AbstractRegistrar):
         scaled, width = problem.scaled(end.scale), end.width
         found = match(scaled, end.T_matched, end.row, width=width)
         found = found.within(limits.farthest)
-        frozen, frozen_found = lax.stop_gradient((problem, found))
+        frozen, frozen_found, held = lax.stop_gradient((problem, found, end))
         weight = lax.stop_gradient(optimiser.weights(frozen_found, end.width))
-        worse = fits_worse(
-            self.kernel, lax.stop_gradient(end), frozen, frozen_found, limits
-        )
+        worse = fits_worse(self.kernel, held, frozen, frozen_found, limits)
         T = jnp.where(worse, init, T)
         scale = jnp.where(worse, start_scale, scale)
         evidence = evidence_at(source, target, T, scale)

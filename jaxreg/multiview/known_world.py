@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.checks import is_concrete
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager, Correntropy
@@ -79,6 +80,8 @@ class KnownWorld(eqx.Module):
 
     def origin_of(self, solution: ReconstructionSolution) -> np.ndarray | None:
         """What is to be added to poses in the world, None where none lies in it."""
+        if not is_concrete(solution.status):
+            return None
         inside = int(solution.status) != Status.DEGENERATE
         return self.known.origin if inside else None
 

@@ -155,10 +155,35 @@ def reconstruct(
             raise ValueError(
                 "order, previous, on_pairs: pairs are chosen outside of jit only."
             )
+        if far.moved:
+            raise ValueError(
+                "scans: far from their origins, moved outside of jit only."
+            )
         solution = _of_all_pairs(method, averaging, inputs, key, known)
-        if known is None:
-            return solution
-        return known.in_world(solution, fixed, moved=False)
+    else:
+        told = order, previous, hold_previous, progress, on_pairs
+        solution = _of_chosen_pairs(method, averaging, inputs, key, known, *told)
+    origin = None if known is None else known.origin_of(solution)
+    solution = far.back(solution, origin)
+    if known is not None:
+        solution = known.in_world(solution, fixed, moved=far.moved)
+    log_solution("reconstruct", solution)
+    return solution
+
+
+def _of_chosen_pairs(
+    method: AbstractRegistrar,
+    averaging: AbstractAverager | None,
+    inputs: tuple[Any, ...],
+    key: Key,
+    known: KnownWorld | None,
+    order: Order,
+    previous: object,
+    hold_previous: bool,
+    progress: Progress | None,
+    on_pairs: OnPairs | None,
+) -> ReconstructionSolution:
+    """Round by round, each of pairs that those before ask for."""
 
     def report(stage: str, done: int, total: int) -> None:
         log_stage(stage, done, total)
@@ -179,13 +204,7 @@ def reconstruct(
     solution = finish(method, averaging, prepared, motions_padded, hold, known)
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
-    solution = solution.of_pairs(len(motions.overlap))
-    origin = None if known is None else known.origin_of(solution)
-    solution = far.back(solution, origin)
-    if known is not None:
-        solution = known.in_world(solution, fixed, moved=far.moved)
-    log_solution("reconstruct", solution)
-    return solution
+    return solution.of_pairs(len(motions.overlap))
 
 
 def _of_all_pairs(
