@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 
 
-# Programs that compile in less are compiled again: reading one takes a tenth of this.
+# Programs that compile in less are compiled again.
 _LEAST_SECONDS = 0.05
 
 

@@ -120,7 +120,7 @@ def average(
         than a tree needs, and nothing agrees beyond what any tree agrees with
         (`log_evidence` is at most 0, and so is that of the spanning tree of greatest
         weight); the poses of `Correntropy` are then those of its start. Or of priors
-        and control points, two and more, no more than half agree.
+        and control points, two and more without fixed poses, no more than half agree.
 
     Raises:
         TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,

@@ -115,7 +115,8 @@ def reconstruct(
         DISCONNECTED where some scans could not be placed, AMBIGUOUS where some can slip
         along the others; `scan_status` says which, and what is wrong with them.
         NO_AGREEMENT where no pairs agree with each other: scans then lie as the pairs
-        of largest overlap have them; and of a scan that is fixed where none of its
+        of largest overlap have them; or of priors and control points, without fixed
+        scans, no more than half agree; and of a scan that is fixed where none of its
         pairs has it. DEGENERATE where what is known holds no part of the scans, as of
         points on a line.
 

@@ -18,8 +18,10 @@ from jaxreg.averaging import (
     edge_report,
     pose_covariances,
 )
+from jaxreg.averaging.world.parts import brought
 from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
+from jaxreg.graph.anchored import KnownPoses
 from tests.averaging.graphs import motions, random_graph, rotations
 
 
@@ -323,6 +325,11 @@ def test_of_two_priors_that_contradict_each_other_none_is_believed():
     sol = average(graph, MotionAveraging(), priors=[(2, X[2]), (5, away)])
     assert sol.status == Status.NO_AGREEMENT
     assert np.sum(np.asarray(sol.prior_weight) > 0.5) == 1
+    sol = average(
+        graph, MotionAveraging(), priors=[(2, X[2]), (5, away)], fixed=[(0, X[0])]
+    )
+    assert sol.status == Status.CONVERGED
+    np.testing.assert_array_equal(np.asarray(sol.prior_weight) > 0.5, [True, False])
 
 
 def test_drift_is_spread_up_to_what_is_known_at_the_far_end():
@@ -345,3 +352,23 @@ def test_drift_is_spread_up_to_what_is_known_at_the_far_end():
     assert sol.status == Status.CONVERGED
     assert np.all(np.asarray(sol.prior_weight) > 0.5)
     assert np.linalg.norm((sol.T_world_i - X)[:, :3, 3], axis=1).max() < 0.2
+
+
+def test_of_many_priors_some_place_a_body():
+    rng = np.random.default_rng(0)
+    X = motions(rotations(rng, 20, 3, 1.0), rng.normal(size=(20, 3)))
+    frame = np.arange(600) % 20
+    known = X[frame].copy()
+    known[:200, :3, 3] += 5 + rng.normal(size=(200, 3))  # the first third is wrong
+    away = motions(rotations(rng, 1, 3, 1.0), rng.normal(size=(1, 3)))[0]
+    poses = KnownPoses(
+        frame=jnp.asarray(frame, jnp.int32),
+        T_world_prior=jnp.asarray(known, jnp.float32),
+        information=None,
+        fixed=jnp.zeros(20, bool),
+        T_world_fixed=jnp.tile(jnp.eye(4), (20, 1, 1)),
+    )
+    part = jnp.zeros(20, jnp.int32)
+    found = brought(jnp.asarray(away @ X, jnp.float32), part, poses, None, jnp.ones(()))
+    assert bool(jnp.all(found.held))
+    np.testing.assert_allclose(found.T_world_i, X, atol=1e-4)

@@ -233,8 +233,7 @@ class Adjustment(eqx.Module):
         """Half of chi-square, of priors and points as far as the kernel counts it."""
         graph = self._informed(T)
         i, j = graph.edges[:, 0], graph.edges[:, 1]
-        gap = product(lie.inverse(graph.T_i_j), product(lie.inverse(T)[i], T[j]))
-        error = lie.log(gap)
+        error = graph.tangent_errors(T)
         assert graph.information is not None
         turned = jnp.sum(graph.information * error[:, None], axis=-1)
         present = graph.mask & self.joined[i] & self.joined[j]

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core import control
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.world.points import ControlPoints
-from jaxreg.averaging.world.rigid_fit import likeliest_place, spans
+from jaxreg.averaging.world.rigid_fit import CHOICES, likeliest_place, spans
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses
 from jaxreg.graph.pose_graph import product
@@ -50,8 +50,9 @@ def brought(
     tips = tips.astype(T_part_i.dtype)
     owner = jnp.repeat(poses.frame, d + 1)
     T_seen = T_part_i[poses.frame]
-    seen = _moved(T_seen, tips).reshape(-1, d)
-    in_world = _moved(poses.T_world_prior, tips).reshape(-1, d)
+    arms = jax.vmap(lambda T: lie.act(T, tips))
+    seen = arms(T_seen).reshape(-1, d)
+    in_world = arms(poses.T_world_prior).reshape(-1, d)
     tried = product(poses.T_world_prior, lie.inverse(T_seen))
     if points is not None:
         owner = jnp.concatenate([owner, points.frame])
@@ -65,7 +66,10 @@ def brought(
 
     def fitted(name: Array) -> tuple[Array, Array]:
         usable = part[owner] == name
-        T, agrees = likeliest_place(seen, in_world, usable, tried)
+        some = tried
+        if len(tried) > CHOICES:
+            some = tried[_spread(part[poses.frame] == name)]
+        T, agrees = likeliest_place(seen, in_world, usable, some)
         agrees = agrees & usable & is_point
         return T, posed[name] | spans(in_world, agrees.astype(T.dtype))
 
@@ -81,7 +85,10 @@ def brought(
     return Brought(T, held)
 
 
-def _moved(T: Float[Array, "n D D"], x: Float[Array, "m d"]) -> Float[Array, "n m d"]:
-    """Points by each of some motions."""
-    R = lie.rotation(T)[:, None]
-    return jnp.sum(R * x[:, None, :], axis=-1) + lie.translation(T)[:, None]
+def _spread(own: Bool[Array, " p"]) -> Int[Array, " m"]:
+    """At most so many rows as are tried, spread over those that are own."""
+    count = jnp.cumsum(own)
+    most = min(len(own), CHOICES)
+    step = jnp.maximum(count[-1] / most, 1)
+    wanted = jnp.floor(jnp.arange(most) * step).astype(count.dtype) + 1
+    return jnp.minimum(jnp.searchsorted(count, wanted), len(own) - 1)

@@ -35,8 +35,7 @@ class ControlPoints(eqx.Module):
 
     def seen(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, "c d"]:
         """Where the poses put them."""
-        at = T_world_i[self.frame]
-        return _turned(lie.rotation(at), self.in_frame) + lie.translation(at)
+        return jax.vmap(lie.act)(T_world_i[self.frame], self.in_frame)
 
     def misfit(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, " c"]:
         """In standard deviations, or in lengths if none are known."""

@@ -15,7 +15,7 @@ from jaxreg.geometry.kabsch import kabsch
 
 #: Choices of points to fit: where half are wrong one of eight choices of three is
 #: right, and none of 256 with a chance of 1e-15.
-_CHOICES = 256
+CHOICES = 256
 #: Deviations of right points that are tried, as shares of their extent.
 _LADDER = tuple(0.3 / 2 ** (n / 2) for n in range(32))
 #: The middle length of a vector of k normal numbers, and that which a hundredth of them
@@ -48,13 +48,13 @@ def likeliest_place(
         tried = jnp.concatenate([tried, also])
 
     def squares(T: Array) -> Array:
-        moved = jnp.sum(lie.rotation(T) * seen[:, None], axis=-1) + lie.translation(T)
-        return jnp.sum((moved - in_world) ** 2, axis=-1)
+        return jnp.sum((lie.act(T, seen) - in_world) ** 2, axis=-1)
 
     extent = jnp.max(jnp.linalg.norm(in_world - in_world[:1], axis=-1))
     extent = jnp.where(extent > 0, extent, 1)
-    scores, sizes = jax.vmap(lambda T: _log_evidence(squares(T), present, extent, d))(
-        tried
+    # One after the other: of thousands of points memory would not hold all.
+    scores, sizes = jax.lax.map(
+        lambda T: _log_evidence(squares(T), present, extent, d), tried
     )
     whole = jnp.all(usable[rows], axis=1)
     if also is not None:
@@ -89,10 +89,10 @@ def _log_evidence(
 
 def _choices(num: int, size: int) -> np.ndarray:
     """Rows of points to fit, all choices if they are few; no key is needed."""
-    if math.comb(num, size) <= _CHOICES:
+    if math.comb(num, size) <= CHOICES:
         return np.array(list(itertools.combinations(range(num), size)))
     draw = np.random.default_rng(0)
-    return np.stack([draw.choice(num, size, replace=False) for _ in range(_CHOICES)])
+    return np.stack([draw.choice(num, size, replace=False) for _ in range(CHOICES)])
 
 
 def spans(in_world: Float[Array, "c d"], trust: Float[Array, " c"]) -> Bool[Array, ""]:

@@ -120,9 +120,10 @@ def _adjusted(
         T, ended, trust = problem.solve(start.T_world_i)
         lost = (ended == Status.MAX_STEPS) | (ended == Status.NON_FINITE)
         status = jnp.where(lost & (status == Status.CONVERGED), ended, status)
-        # Where half of what is known contradicts the rest, which is right is chance.
+        # Where half of what is known contradicts the rest, which is right is chance,
+        # unless fixed frames decide.
         right, count = jnp.sum(trust > 0.5), jnp.sum(problem.usable)
-        undecided = (count > 1) & (2 * right <= count)
+        undecided = (count > 1) & (2 * right <= count) & ~jnp.any(poses.fixed)
         status = jnp.where(undecided, Status.NO_AGREEMENT, status)
     beside = jnp.any(start.held)
     joined = jnp.where(beside, start.held, part == part[0])
