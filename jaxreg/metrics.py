@@ -24,12 +24,8 @@ from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.geometry.kabsch import kabsch
 from jaxreg.geometry.nearest_rotation import nearest_rotation
-from jaxreg.graph.pose_graph import (
-    PoseGraph,
-    check_graph,
-    check_poses,
-    chordal_weights,
-)
+from jaxreg.graph.chordal import chordal_weights
+from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
 
 
 Align = Literal["first", "best", "positions", "none"]
@@ -68,7 +64,7 @@ def _aligned(T_world_i: Array, T_true_i: Array, align: Align, mask: Array) -> Ar
     if align == "none":
         return T_world_i
     if align == "first":
-        return T_true_i[0] @ lie.inverse(T_world_i[0]) @ T_world_i
+        return T_true_i[0] @ lie.between(T_world_i[0], T_world_i)
     dtype = T_world_i.dtype
     if align == "positions":
         positions = lie.translation(T_world_i), lie.translation(T_true_i)
@@ -164,8 +160,8 @@ def relative_errors(
 
 @eqx.filter_jit
 def _relative_errors(T: Array, T_true: Array) -> tuple[Array, Array]:
-    found = lie.inverse(T[:-1]) @ T[1:]
-    gap = lie.inverse(lie.inverse(T_true[:-1]) @ T_true[1:]) @ found
+    found = lie.between(T[:-1], T[1:])
+    gap = lie.between(lie.between(T_true[:-1], T_true[1:]), found)
     sq = jnp.sum(lie.translation(gap) ** 2, axis=-1)
     length = jnp.where(sq > 0, jnp.sqrt(jnp.where(sq > 0, sq, 1)), 0)
     return lie.rotation_angle(lie.rotation(gap)), length

@@ -22,7 +22,6 @@ from jaxreg.averaging import (
     SpanningTree,
     average,
 )
-from jaxreg.averaging.measures import length_scale
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_errors, translation_errors
 from tests.averaging.graphs import random_graph
@@ -127,7 +126,7 @@ def errors_of(graph: PoseGraph, T, T_true) -> tuple:
     angles = jax.vmap(lambda G: rotation_errors(G @ T, T_true, "none"))(relative)
     shifts = jax.vmap(lambda G: translation_errors(G @ T, T_true, "none"))(relative)
     right = (angles < jnp.deg2rad(5.0)) & (shifts < 0.05)
-    scale = length_scale(graph)
+    scale = graph.length_scale
     margin = agreement(graph, T, scale) - agreement(graph, T_true, scale)
     frames = jnp.max(jnp.mean(right, axis=1))
     return jnp.mean(rotation), jnp.mean(translation), frames, margin

@@ -1,4 +1,4 @@
-"""The quantile of masked non-negative numbers by bisection, without sorting.
+"""Quantiles of masked numbers: of non-negative ones by bisection, without sorting.
 
 The bits of a non-negative float, read as an integer, grow with the float. So the
 quantile is found bit by bit, each by one count of the values below a threshold.
@@ -70,3 +70,13 @@ def _value_of(
 
     found = control.fori_loop(0, bits, set_bit, jnp.zeros((), kind))
     return jnp.where(count > 0, lax.bitcast_convert_type(found, x.dtype), 0)
+
+
+def nearest_rank(
+    x: Float[Array, " e"], mask: Bool[Array, " e"], q: float | Array
+) -> Float[Array, ""]:
+    """The value of `x[mask]` at quantile q (nearest rank); 0 if the mask is empty."""
+    count = jnp.sum(mask)
+    rank = jnp.floor(q * (count - 1).astype(x.dtype) + 0.5).astype(jnp.int32)
+    value = jnp.sort(jnp.where(mask, x, jnp.inf))[jnp.maximum(rank, 0)]
+    return jnp.where(count > 0, value, 0)

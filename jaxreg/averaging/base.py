@@ -16,7 +16,7 @@ from jaxreg._core.loop import status_of
 from jaxreg._core.status import Status, counted
 from jaxreg._core.typing import Key, StatusArray
 from jaxreg.averaging.likelihood import log_evidence, nothing_agrees
-from jaxreg.averaging.measures import frobenius, length_scale, weighted_mean
+from jaxreg.averaging.measures import frobenius, weighted_mean
 from jaxreg.averaging.trace import AveragingTrace
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
@@ -46,7 +46,7 @@ class AveragingSolution(eqx.Module):
             at unknown noise and share of right edges, less what fitting the poses is
             worth (`jaxreg.averaging.likelihood`). At most 0: nothing agrees beyond
             what a tree agrees with by itself; poses of one graph compare by it.
-        length_scale: the length that stands for one radian; see `length_scale`.
+        length_scale: the length that stands for one radian; see `PoseGraph`.
         trace: how the method came to rest, or None if it takes no steps of its own.
         prior_weight: `(p,)` how much each prior is trusted, then each control point,
             from 0 to 1; 0 for priors of frames that are fixed. None without any.
@@ -124,7 +124,7 @@ def solution(
 ) -> AveragingSolution:
     """Fills in what is the same for every method."""
     dtype = T_world_i.dtype
-    scale = length_scale(graph)
+    scale = graph.length_scale
     trust = jnp.ones(graph.weight.shape, dtype) if edge_weight is None else edge_weight
     done = jnp.asarray(True) if converged is None else converged
     width = jnp.full((2,), jnp.inf, dtype) if kernel_width is None else kernel_width

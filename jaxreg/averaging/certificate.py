@@ -29,7 +29,8 @@ from jaxreg.averaging.relaxation.connection import (
     rigid,
 )
 from jaxreg.averaging.world.adjusted import check_solution
-from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
+from jaxreg.graph.chordal import chordal_weights
+from jaxreg.graph.pose_graph import PoseGraph
 
 
 # Of the certified gap, what the shift of the eigenvalues may cost.

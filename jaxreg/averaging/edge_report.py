@@ -16,7 +16,7 @@ from jaxreg.averaging.measures import deviations
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
 from jaxreg.averaging.world.adjusted import Told, as_adjusted
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 
 
 @dataclass(frozen=True, repr=False)
@@ -180,8 +180,7 @@ def _linearised(
     if graph.information is None:
         Omega = Omega / noise[1] ** 2
     W = jnp.where(trusted[:, None, None], Omega, 0)
-    i, j = graph.edges[:, 0], graph.edges[:, 1]
-    J = -lie.adjoint(product(lie.inverse(T)[j], T[i]))
+    J = -lie.adjoint(lie.inverse(graph.predicted(T)))
     H = normal_equations(graph, T, W)[0] if few else None
     return _Linearised(graph.tangent_errors(T), Omega, W, J, H)
 

@@ -65,7 +65,7 @@ def _prepared(
         finite = finite & jnp.all(sound)
         init = jnp.where(sound[:, None, None], init, jnp.eye(d + 1, dtype=dtype))
         T_world_0 = init[0]
-        T_0_i = lie.inverse(T_world_0) @ init
+        T_0_i = lie.between(T_world_0, init)
         T_start = lie.compose(lie.rotation(T_0_i), lie.translation(T_0_i) / unit)
     return reduced, method, T_start, _Gauge(T_world_0, unit, component, finite)
 

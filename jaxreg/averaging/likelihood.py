@@ -41,10 +41,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
-from jaxreg.averaging.measures import length_scale, nearest_rank, num_held
+from jaxreg._core.quantile import nearest_rank
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 
 
 #: Deviations of right edges, radians and length scales: octaves from where the normal
@@ -99,7 +99,7 @@ def nothing_agrees(graph: PoseGraph, evidence: Float[Array, ""]) -> Bool[Array, 
         evidence: `log_evidence` of the answer. Where it has none, because wrong motions
             pulled on it, the spanning tree of greatest weight may have some.
     """
-    spare = jnp.sum(graph.weight > 0) > num_held(graph) - 1
+    spare = jnp.sum(graph.weight > 0) > graph.num_held - 1
 
     def of_tree() -> Array:
         args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
@@ -137,7 +137,7 @@ def explained(
     is_near = (rank < bound).astype(sq.dtype)  # (t + 1, e)
     band = jnp.diff(is_near, axis=0, prepend=0)
     allowed = log_odds[:, None] >= jnp.maximum(log_odds, 0)  # near, far
-    free, reach = num_held(graph) - 1, _reach(graph.dim)
+    free, reach = graph.num_held - 1, _reach(graph.dim)
 
     def log_gain(deviation: Array) -> tuple[Array, Array]:
         """The logarithm of g for each edge, and for one that holds exactly."""
@@ -186,7 +186,7 @@ def agreed_share(
     """
     present = jnp.sum(graph.weight > 0)
     right = jnp.sum(explained(graph, T_world_i).log_odds > 0)
-    tree = num_held(graph).astype(right.dtype) - 1
+    tree = graph.num_held.astype(right.dtype) - 1
     tree = jnp.where(present > tree, tree, 0)
     count = jnp.maximum(present - tree, 1).astype(graph.weight.dtype)
     return (right - tree) / count
@@ -197,7 +197,7 @@ def squared_errors(
 ) -> Float[Array, " e"]:
     """Squared angle (chordal) plus squared length over `length_scale` of each edge."""
     rotation, translation = graph.differences(T_world_i)
-    return rotation / 2 + translation / length_scale(graph) ** 2
+    return rotation / 2 + translation / graph.length_scale**2
 
 
 def prior_odds(graph: PoseGraph) -> Float[Array, " e"]:
@@ -227,9 +227,9 @@ def _neighbour_rank(
     and squared length over `length_scale`. Edges as near as each other share a rank.
     """
     i, j = graph.edges[:, 0], graph.edges[:, 1]
-    gap = product(lie.inverse(T_world_i)[i], T_world_i[j])
+    gap = graph.predicted(T_world_i)
     far = graph.dim - jnp.trace(lie.rotation(gap), axis1=-2, axis2=-1)
-    shift = jnp.sum(lie.translation(gap) ** 2, axis=-1) / length_scale(graph) ** 2
+    shift = jnp.sum(lie.translation(gap) ** 2, axis=-1) / graph.length_scale**2
     far = jnp.where(graph.weight > 0, far + shift, jnp.inf)
     frame, far = jnp.concatenate([i, j]), jnp.concatenate([far, far])
     place = jnp.arange(len(frame), dtype=jnp.int32)

@@ -1,49 +1,10 @@
-"""Measures of graphs that every method uses: lengths, counts, means, middles."""
+"""Measures of answers that every method uses."""
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
-
-
-def length_scale(graph: PoseGraph) -> Float[Array, ""]:
-    """The length that stands for one radian: the mean |t_i_j| of the middle half.
-
-    It comes from the data, so that another unit of length gives the same answer.
-    Half of the edges may be wrong without moving it far. 1 if there is no length.
-    """
-    length = jnp.linalg.norm(
-        lie.translation(jax.lax.stop_gradient(graph.T_i_j)), axis=-1
-    )
-    valid = graph.weight > 0
-    low, high = (
-        nearest_rank(length, valid, 0.25),
-        nearest_rank(length, valid, 0.75),
-    )
-    middle = valid & (length >= low) & (length <= high)
-    count = jnp.maximum(jnp.sum(middle), 1).astype(length.dtype)
-    mean = jnp.sum(jnp.where(middle, length, 0)) / count
-    return jnp.where(mean > 0, mean, 1)
-
-
-def num_held(graph: PoseGraph) -> Float[Array, ""]:
-    """The number of frames that edges hold, at least one; padding is not held."""
-    w = graph.weight
-    held = jnp.zeros((graph.num_poses,), w.dtype)
-    held = held.at[graph.edges[:, 0]].max(w).at[graph.edges[:, 1]].max(w)
-    return jnp.maximum(jnp.sum(held > 0, dtype=w.dtype), 1)
-
-
-def nearest_rank(
-    x: Float[Array, " e"], mask: Bool[Array, " e"], q: float | Array
-) -> Float[Array, ""]:
-    """The value of `x[mask]` at quantile q (nearest rank); 0 if the mask is empty."""
-    count = jnp.sum(mask)
-    rank = jnp.floor(q * (count - 1).astype(x.dtype) + 0.5).astype(jnp.int32)
-    value = jnp.sort(jnp.where(mask, x, jnp.inf))[jnp.maximum(rank, 0)]
-    return jnp.where(count > 0, value, 0)
 
 
 def frobenius(

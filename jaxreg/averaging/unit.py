@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.measures import nearest_rank
+from jaxreg._core.quantile import nearest_rank
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 

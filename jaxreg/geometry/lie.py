@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Key, Motions
 from jaxreg.geometry.nearest_rotation import nearest_rotation
+from jaxreg.linear.small import product
 
 
 P = ParamSpec("P")
@@ -185,6 +186,13 @@ def inverse(T: Motions) -> Motions:
     """The inverse motion, by transposition."""
     R_inv = jnp.swapaxes(rotation(T), -1, -2)
     return compose(R_inv, -jnp.sum(R_inv * translation(T)[..., None, :], axis=-1))
+
+
+def between(
+    T_a_b: Float[Array, "*#b D D"], T_a_c: Float[Array, "*#b D D"]
+) -> Float[Array, "*b D D"]:
+    """`T_b_c`, the inverse of the one times the other."""
+    return product(inverse(T_a_b), T_a_c)
 
 
 def act(T: Float[Array, "D D"], points: Float[Array, "*n d"]) -> Float[Array, "*n d"]:

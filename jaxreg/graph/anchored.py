@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.linear.small import product
 
 
 class KnownPoses(eqx.Module):

@@ -15,6 +15,7 @@ from jaxreg._core.checks import (
     is_concrete,
     shown,
 )
+from jaxreg._core.quantile import nearest_rank
 from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.graph.edge_checks import (
@@ -26,14 +27,7 @@ from jaxreg.graph.edge_checks import (
     check_weights,
     count_poses,
 )
-from jaxreg.linear.small import inverse
-
-
-def product(
-    A: Float[Array, "*#b p q"], B: Float[Array, "*#b q r"]
-) -> Float[Array, "*b p r"]:
-    """A @ B for many small matrices: a broadcast sum is several times faster on CPU."""
-    return jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2)
+from jaxreg.linear.small import product
 
 
 class PoseGraph(eqx.Module):
@@ -171,6 +165,36 @@ class PoseGraph(eqx.Module):
         """The dimension d of space, 2 or 3."""
         return self.T_i_j.shape[-1] - 1
 
+    @property
+    def length_scale(self) -> Float[Array, ""]:
+        """The length that stands for one radian: the mean |t_i_j| of the middle half.
+
+        It comes from the data, so that another unit of length gives the same answer.
+        Half of the edges may be wrong without moving it far. 1 if there is no length.
+
+        Gradients: none (cut).
+        """
+        shift = lie.translation(jax.lax.stop_gradient(self.T_i_j))
+        length, valid = jnp.linalg.norm(shift, axis=-1), self.weight > 0
+        low, high = (nearest_rank(length, valid, q) for q in (0.25, 0.75))
+        middle = valid & (length >= low) & (length <= high)
+        count = jnp.maximum(jnp.sum(middle), 1).astype(length.dtype)
+        mean = jnp.sum(jnp.where(middle, length, 0)) / count
+        return jnp.where(mean > 0, mean, 1)
+
+    @property
+    def num_held(self) -> Float[Array, ""]:
+        """The number of frames that edges hold, at least one; padding is not held."""
+        w = self.weight
+        held = jnp.zeros((self.num_poses,), w.dtype)
+        held = held.at[self.edges[:, 0]].max(w).at[self.edges[:, 1]].max(w)
+        return jnp.maximum(jnp.sum(held > 0, dtype=w.dtype), 1)
+
+    def predicted(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, "e D D"]:
+        """What poses make of each motion: `inv(T_world_i) T_world_j`."""
+        i, j = self.edges[:, 0], self.edges[:, 1]
+        return lie.between(T_world_i[i], T_world_i[j])
+
     def residual_motions(
         self, T_world_i: Float[Array, "v D D"]
     ) -> Float[Array, "e D D"]:
@@ -188,8 +212,7 @@ class PoseGraph(eqx.Module):
             Of the rotation (about 2 angle^2) and of the translation (length^2); 0 where
             masked.
         """
-        i, j = self.edges[:, 0], self.edges[:, 1]
-        gap = self.T_i_j - product(lie.inverse(T_world_i)[i], T_world_i[j])
+        gap = self.T_i_j - self.predicted(T_world_i)
         gap = jnp.where(self.mask[:, None, None], gap, 0)
         return (
             jnp.sum(lie.rotation(gap) ** 2, axis=(-2, -1)),
@@ -198,9 +221,7 @@ class PoseGraph(eqx.Module):
 
     def tangent_errors(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, "e k"]:
         """`log(inv(T_i_j) inv(T_world_i) T_world_j)`, the error of g2o and GTSAM."""
-        i, j = self.edges[:, 0], self.edges[:, 1]
-        predicted = product(lie.inverse(T_world_i)[i], T_world_i[j])
-        return lie.log(product(lie.inverse(self.T_i_j), predicted))
+        return lie.log(lie.between(self.T_i_j, self.predicted(T_world_i)))
 
     def __repr__(self) -> str:
         batch = self.edges.shape[:-2]
@@ -233,28 +254,3 @@ def check_poses(T: object, name: str, graph: PoseGraph) -> Float[Array, "v D D"]
     if found.shape != wanted:
         raise ValueError(f"{name}: wanted shape {wanted}, found {found.shape}.")
     return found
-
-
-def chordal_weights(
-    graph: PoseGraph,
-) -> tuple[Float[Array, " e"], Float[Array, " e"]]:
-    """SE-Sync's precisions kappa (rotation) and tau (translation) of each edge.
-
-    From the blocks I_tt and I_rr of the information: in 3D tau = 3 / tr(inv(I_tt)) and
-    kappa = 3 / (2 tr(inv(I_rr))), in 2D tau = 2 / tr(inv(I_tt)) and kappa = I_rr. Both
-    are times the prior weight, and 1 without information; 0 where masked.
-    """
-    if graph.information is None:
-        return graph.weight, graph.weight
-    d = graph.dim
-    real = graph.mask & (graph.weight > 0)
-    k = graph.information.shape[-1]
-    eye = jnp.eye(k, dtype=graph.weight.dtype)
-    info = jnp.where(real[:, None, None], graph.information, eye)
-    tau = d / jnp.trace(inverse(info[:, :d, :d]), axis1=-2, axis2=-1)
-    if d == 2:
-        kappa = info[:, 2, 2]
-    else:
-        covariance = inverse(info[:, d:, d:])
-        kappa = 1.5 / jnp.trace(covariance, axis1=-2, axis2=-1)
-    return graph.weight * kappa, graph.weight * tau

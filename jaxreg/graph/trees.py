@@ -19,7 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.linear.small import product
 
 
 class Forest(eqx.Module):
@@ -94,7 +95,7 @@ def maximum_spanning_tree(
         start,
     )
     reached = end.component == end.component[0]
-    T_world_i = product(lie.inverse(end.T_root_i[0]), end.T_root_i)
+    T_world_i = lie.between(end.T_root_i[0], end.T_root_i)
     eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
     T_world_i = jnp.where(reached[:, None, None], T_world_i, eye).at[0].set(eye)
     return Forest(T_world_i, reached, end.component, end.in_tree)

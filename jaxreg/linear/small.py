@@ -16,6 +16,13 @@ from jaxtyping import Array, Float
 from jaxreg._core import control
 
 
+def product(
+    A: Float[Array, "*#b p q"], B: Float[Array, "*#b q r"]
+) -> Float[Array, "*b p r"]:
+    """A @ B for many small matrices: a broadcast sum is several times faster on CPU."""
+    return jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2)
+
+
 def after(x: Array, earlier: Array) -> Array:
     """The same x, computed after `earlier`: a chain for two calls of LAPACK.
 

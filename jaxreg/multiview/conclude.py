@@ -123,7 +123,7 @@ def _in_first_frames(
     """
     first = placement.part
     ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
-    T_first_i = lie.inverse(placement.T_world_i[first]) @ placement.T_world_i
+    T_first_i = lie.between(placement.T_world_i[first], placement.T_world_i)
     T = scans.to_input_frames(T_first_i, first, ids)
     eye = jnp.eye(T.shape[-1], dtype=T.dtype)
     T = jnp.where((ids != first)[:, None, None], T, eye)

@@ -47,7 +47,7 @@ def _grips(
 
     def one(pair: Array) -> Grip:
         i, j = pair
-        T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
+        T_i_j = lie.between(T_world_i[i], T_world_i[j])
         witness = scans.witness(i, j)
         found = witness.of_pose(T_i_j)
         use = (found.log_evidence >= least) & placement.together(i, j)

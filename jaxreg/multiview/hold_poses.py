@@ -71,7 +71,7 @@ class Held(eqx.Module):
     def in_world(self, solution: ReconstructionSolution) -> ReconstructionSolution:
         """A solution in the world of those that stay, which have their very poses."""
         one = jnp.argmax(self.held)
-        T_one_i = lie.inverse(solution.T_world_i[one]) @ solution.T_world_i
+        T_one_i = lie.between(solution.T_world_i[one], solution.T_world_i)
         T = jnp.where(
             solution.placed[:, None, None],
             self.T_world_i[one] @ T_one_i,
@@ -86,13 +86,13 @@ def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
     """With the held poses; each other scan follows the held one nearest to it."""
     ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
     one = jnp.argmax(hold.held).astype(jnp.int32)
-    T_one_i = lie.inverse(hold.T_world_i[one]) @ hold.T_world_i
+    T_one_i = lie.between(hold.T_world_i[one], hold.T_world_i)
     T_held = scans.to_centred_frames(T_one_i, jnp.full_like(ids, one), ids)
     centre = lie.translation(found.T_world_i)
     far = jnp.sum((centre[:, None] - centre[None, :]) ** 2, axis=-1)
     beside = hold.held[None, :] & (found.part[:, None] == found.part[None, :])
     near = jnp.argmin(jnp.where(beside, far, jnp.inf), axis=1)
-    T_near_i = lie.inverse(found.T_world_i[near]) @ found.T_world_i
+    T_near_i = lie.between(found.T_world_i[near], found.T_world_i)
     stays = hold.held | ~jnp.any(beside, axis=1)
     T = jnp.where(hold.held[:, None, None], T_held, T_held[near] @ T_near_i)
     T = jnp.where((stays & ~hold.held)[:, None, None], found.T_world_i, T)
@@ -123,7 +123,7 @@ def _contracted(
 def _expanded(hold: Held, before: Placement, nodes: Placement) -> Placement:
     """Poses of the scans by those of the nodes."""
     beside = nodes.together(hold.node, jnp.zeros_like(hold.node))
-    T = (lie.inverse(nodes.T_world_i[0]) @ nodes.T_world_i)[hold.node]
+    T = lie.between(nodes.T_world_i[0], nodes.T_world_i)[hold.node]
     moves = (beside & ~hold.held)[:, None, None]
     T = jnp.where(moves, T, before.T_world_i)
     ids = jnp.arange(len(beside), dtype=jnp.int32)

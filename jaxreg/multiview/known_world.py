@@ -23,7 +23,7 @@ from jaxreg.averaging.world.arguments import Known, check_known
 from jaxreg.averaging.world.solve import average_in_world, moved_back
 from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
-from jaxreg.graph.pose_graph import product
+from jaxreg.linear.small import product
 from jaxreg.multiview.pair_trust import pair_trust
 from jaxreg.multiview.place import Placement, joins, prior_weight
 from jaxreg.multiview.prepare import PreparedScans

@@ -25,7 +25,7 @@ def pair_trust(
     """
     i, j = motions.pairs[:, 0], motions.pairs[:, 1]
     T_world_i = placement.T_world_i
-    T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
+    T_i_j = lie.between(T_world_i[i], T_world_i[j])
     turn, shift = displacement(T_i_j, motions.T_i_j[:, 0])
     sq = turn**2 + shift**2
     spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])

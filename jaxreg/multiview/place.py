@@ -166,7 +166,7 @@ def _agreeing(
 ) -> Int[Array, " e"]:
     """The first of each pair's modes that agrees with the poses; if none, the best."""
     i, j = motions.pairs.T
-    T_i_j = lie.inverse(found.T_world_i[i]) @ found.T_world_i[j]
+    T_i_j = lie.between(found.T_world_i[i], found.T_world_i[j])
     turn, shift = displacement(T_i_j[:, None], motions.T_i_j)
     agrees = (turn < _AGREES) & (shift < _AGREES) & likely(motions, least)
     agrees = agrees & found.together(i, j)[:, None]

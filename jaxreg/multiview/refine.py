@@ -107,12 +107,12 @@ def measured(
     def measured(pair: Array) -> Motion:
         i, j = pair
         problem = _problem(scans, i, j, exact)
-        T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
+        T_i_j = lie.between(T_world_i[i], T_world_i[j])
         return lie.orthonormalise(optimiser.repeat(problem, T_i_j, widths))
 
     def one(pair: Array) -> RelativeMotions:
         i, j = pair
-        T_i_j = lie.inverse(T_world_i[i]) @ T_world_i[j]
+        T_i_j = lie.between(T_world_i[i], T_world_i[j])
         found, together = scans.witness(i, j).of_pose(T_i_j), placement.together(i, j)
         told = jnp.where(together, found.log_evidence, NO_EVIDENCE)
         T_i_j = control.cond(told >= least, measured, lambda _: T_i_j, pair)

@@ -185,7 +185,7 @@ def _prospects(
 
     def share(pair: Array) -> Array:
         i, j = pair
-        T_i_j = lie.inverse(T[i]) @ T[j]
+        T_i_j = lie.between(T[i], T[j])
         problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
         return control.cond(
             found.together(i, j),

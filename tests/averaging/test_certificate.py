@@ -23,7 +23,7 @@ from jaxreg.averaging.relaxation.certificate_matrix import CertificateMatrix
 from jaxreg.averaging.relaxation.connection import Connection, lifted
 from jaxreg.averaging.relaxation.staircase import climb
 from jaxreg.graph import PoseGraph
-from jaxreg.graph.pose_graph import chordal_weights
+from jaxreg.graph.chordal import chordal_weights
 from jaxreg.io import read_g2o
 from jaxreg.metrics import chordal_objective
 from tests.averaging.graphs import motions, random_graph, rotations

@@ -4,7 +4,6 @@ import pytest
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import LowRankSparse, average
-from jaxreg.averaging.measures import length_scale
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import random_graph
 
@@ -45,7 +44,7 @@ def test_the_split_against_singular_values_in_numpy():
     with jax.enable_x64(True):
         graph = PoseGraph.from_edges(edges, T)
         solution = average(graph, LowRankSparse(tolerance=1e-10))
-        expected = naive_split(T, edges, float(length_scale(graph)))
+        expected = naive_split(T, edges, float(graph.length_scale))
     assert solution.status == Status.CONVERGED
     np.testing.assert_allclose(solution.T_world_i, expected, atol=1e-6)
     np.testing.assert_allclose(solution.T_world_i, X, atol=0.1)

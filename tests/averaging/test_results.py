@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxreg._core.status import Status
 from jaxreg.averaging import MotionAveraging, average, pose_covariances
-from jaxreg.averaging.measures import deviations, length_scale
+from jaxreg.averaging.measures import deviations
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import motions, random_graph, rotations
 
@@ -61,7 +61,7 @@ def test_the_length_scale_is_the_mean_of_the_middle_half():
     edges = np.stack([np.arange(41), np.arange(1, 42)], axis=1)
     graph = PoseGraph.from_edges(edges, T.astype(np.float32)).padded(60)
     length = np.sort(np.linalg.norm(T[:, :3, 3], axis=1))
-    np.testing.assert_allclose(length_scale(graph), length[10:31].mean(), rtol=1e-5)
+    np.testing.assert_allclose(graph.length_scale, length[10:31].mean(), rtol=1e-5)
 
 
 def test_frames_that_no_edge_names_are_not_placed():

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxreg as jr
 from jaxreg.graph import PoseGraph
-from jaxreg.graph.pose_graph import chordal_weights
+from jaxreg.graph.chordal import chordal_weights
 from jaxreg.io.errors import InputError
 from jaxreg.io.graphs.g2o import read_g2o, read_g2o_poses, write_g2o
 from tests.helpers import data_dir

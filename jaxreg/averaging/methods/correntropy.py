@@ -21,7 +21,6 @@ from jaxreg.averaging.likelihood import (
     least_after_fitting,
     log_evidence,
 )
-from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.methods.graduated import graduated
 from jaxreg.averaging.methods.motion_averaging import iterate_plain
 from jaxreg.averaging.start.closures import without_lone_closures
@@ -103,7 +102,7 @@ class Correntropy(AbstractAverager):
         chance would.
         """
         fixed, T_start = jax.lax.stop_gradient((graph, T_start))
-        scale = length_scale(fixed)
+        scale = fixed.length_scale
         T = _better_start(fixed, T_start, fixed)
         least = least_after_fitting(explained(fixed, T))
         width = first_width(fixed, T)

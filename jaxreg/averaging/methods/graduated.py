@@ -14,18 +14,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.loop import AbstractIteration, iterate
+from jaxreg._core.quantile import nearest_rank
 from jaxreg.averaging.likelihood import (
     SETTLED,
     agreed_share,
     explained,
     squared_errors,
 )
-from jaxreg.averaging.measures import (
-    length_scale,
-    nearest_rank,
-    num_held,
-    weighted_mean,
-)
+from jaxreg.averaging.measures import weighted_mean
 from jaxreg.averaging.steps.edge_errors import LogError
 from jaxreg.averaging.steps.gauss_newton import gauss_newton_gradients, precisions
 from jaxreg.averaging.steps.iterate import Iterated, pose_change
@@ -178,7 +174,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         new = minimise(now, s.found.T, self.max_steps, least, s.found.cycle)
         squares = now.squares(new.T)
         trust = now.trust(squares)
-        change = pose_change(s.found.T, new.T, length_scale(graph))
+        change = pose_change(s.found.T, new.T, graph.length_scale)
         trusted = weighted_mean(trust, graph.weight)
         wanted = _DEVIATIONS * self._deviation(squares, trust, width)
         next_width = jnp.clip(wanted, width / 2, width)
@@ -202,7 +198,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         """
         graph, present = self.graph, self.trusted
         open_edges = self._open(T) & present
-        chained = jnp.sum(present & ~open_edges) > 0.5 * (num_held(graph) - 1)
+        chained = jnp.sum(present & ~open_edges) > 0.5 * (graph.num_held - 1)
         middle = nearest_rank(squares, present, 0.5) * self._spare_factor
         middle = middle / chi2_median(lie.tangent_dim(graph.dim))
         doubted = jnp.any((graph.weight > 0) & ~present)
@@ -231,7 +227,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         """
         middle = middle_variances(self.graph, T, self._open(T) & (trust > 0.5))
         floor = 64 * jnp.finfo(middle.dtype).eps
-        floor = floor * jnp.stack([length_scale(self.graph), jnp.ones_like(middle[1])])
+        floor = floor * jnp.stack([self.graph.length_scale, jnp.ones_like(middle[1])])
         return jnp.maximum(jnp.sqrt(middle * self._spare_factor), floor)
 
     @property

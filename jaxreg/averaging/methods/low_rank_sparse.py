@@ -24,7 +24,6 @@ from jaxreg.averaging.base import (
     of_start,
     solution,
 )
-from jaxreg.averaging.measures import length_scale
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import DENSE_LIMIT
@@ -78,7 +77,7 @@ class LowRankSparse(AbstractAverager):
                 "use SpanningTree or CycleConsensus."
             )
         held, method = jax.lax.stop_gradient((graph, self))
-        scale = length_scale(held)
+        scale = held.length_scale
         X, seen = _blocks(held, scale)
         limit = jnp.maximum(method.tolerance, 8 * jnp.finfo(X.dtype).eps)
         splitting = _Splitting(X, seen, jnp.asarray(method.threshold), limit)

@@ -19,7 +19,7 @@ from jaxreg._core.checks import (
 )
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
-from jaxreg.averaging.measures import frobenius, length_scale, weighted_mean
+from jaxreg.averaging.measures import frobenius, weighted_mean
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus
 from jaxreg.averaging.steps.iterate import (
     averaging_gradients,
@@ -83,7 +83,7 @@ class MCC(AbstractAverager):
     def _from_start(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"]
     ) -> AveragingSolution:
-        scale = length_scale(graph)
+        scale = graph.length_scale
         end = iterate(
             graph,
             T_start,

@@ -20,7 +20,8 @@ from jaxreg.averaging.relaxation.connection import Connection, joined, rigid
 from jaxreg.averaging.relaxation.staircase import Climbed, climb
 from jaxreg.averaging.steps.edge_errors import ChordalError
 from jaxreg.averaging.steps.levenberg_marquardt import minimise
-from jaxreg.graph.pose_graph import PoseGraph, chordal_weights
+from jaxreg.graph.chordal import chordal_weights
+from jaxreg.graph.pose_graph import PoseGraph
 
 
 # Of the objective, what the bound of `certify` may lose to rounding.

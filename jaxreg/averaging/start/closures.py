@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
-from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.start.cycles import NEUTRAL
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import along_frames
+from jaxreg.linear.small import product
 
 
 # Closures next to each other have ends less than so many frames apart, and are less
@@ -50,7 +50,7 @@ def confirmed(graph: PoseGraph, closure: Bool[Array, " e"]) -> Bool[Array, " e"]
     turned = graph.edges[:, 0] > graph.edges[:, 1]
     T_low_high = jnp.where(turned[:, None, None], lie.inverse(graph.T_i_j), graph.T_i_j)
     low, high = jnp.min(graph.edges, axis=1), jnp.max(graph.edges, axis=1)
-    T_world_i, scale = along_frames(graph), length_scale(graph)
+    T_world_i, scale = along_frames(graph), graph.length_scale
     order = jnp.arange(graph.num_edges, dtype=jnp.int32)
     cell = jnp.where(closure, low // _NEAR, graph.num_poses)
     order = jax.lax.sort((cell, high, order), num_keys=2)[2]
@@ -60,8 +60,8 @@ def confirmed(graph: PoseGraph, closure: Bool[Array, " e"]) -> Bool[Array, " e"]
 
     def compared(step: Array, supported: Array) -> Array:
         k, m = jnp.roll(low, -step), jnp.roll(high, -step)
-        expected = product(lie.inverse(T_world_i)[k], product(gap, T_world_i[m]))
-        error = product(lie.inverse(jnp.roll(T_low_high, -step, axis=0)), expected)
+        expected = lie.between(T_world_i[k], product(gap, T_world_i[m]))
+        error = lie.between(jnp.roll(T_low_high, -step, axis=0), expected)
         near = (jnp.roll(cell, -step) == cell) & (jnp.abs(m - high) < _NEAR)
         agree = near & closure[order] & (_size(error, scale) < NEUTRAL[0] ** 2)
         return supported | agree | jnp.roll(agree, step)

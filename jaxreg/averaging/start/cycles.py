@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from jaxreg._core import control
 from jaxreg.averaging.likelihood import DEVIATIONS, prior_odds
-from jaxreg.averaging.measures import length_scale
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import DENSE_LIMIT
@@ -120,4 +119,4 @@ def _closing_errors(graph: PoseGraph, T_a_b: Array) -> Array:
             trace = trace + C[a, b] * sum(A[a, c] * B[c, b] for c in range(d))
         t = sum(A[a, c] * B[c, d] for c in range(d)) + A[a, d] - C[a, d]
         shift = shift + t**2
-    return jnp.maximum(d - trace, 0) + shift / length_scale(graph) ** 2
+    return jnp.maximum(d - trace, 0) + shift / graph.length_scale**2

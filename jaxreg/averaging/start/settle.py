@@ -6,14 +6,14 @@ from jaxtyping import Array, Float
 
 from jaxreg._core import control
 from jaxreg.averaging.likelihood import explained
-from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.start.cycles import ROUNDS
 from jaxreg.averaging.steps.iterate import nearby_rotation
 from jaxreg.averaging.steps.kernel_width import KERNEL_DEVIATIONS, gaussian_trust
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import laplacian
 from jaxreg.linear.operator import divergence
+from jaxreg.linear.small import product
 
 
 def settled(
@@ -24,7 +24,7 @@ def settled(
     A chain of motions drifts; what agrees with it shows only then. The kernel follows
     the likeliest deviation. Dense over frames.
     """
-    num, scale = graph.num_poses, length_scale(graph)
+    num, scale = graph.num_poses, graph.length_scale
 
     def step(_: Array, T: Array) -> Array:
         w = KERNEL_DEVIATIONS * explained(graph, T).deviation

@@ -17,8 +17,7 @@ from jaxreg._core.typing import Scalar
 from jaxreg.averaging.steps.iterate import nearby_rotation
 from jaxreg.averaging.steps.levenberg_marquardt import Problem
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import product
-from jaxreg.linear.small import root_semidefinite
+from jaxreg.linear.small import product, root_semidefinite
 
 
 class Minimum(NamedTuple):

@@ -9,7 +9,9 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.brief import BriefModule
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, chordal_weights, product
+from jaxreg.graph.chordal import chordal_weights
+from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.linear.small import product
 
 
 class AbstractEdgeError(BriefModule):
@@ -44,7 +46,7 @@ class LogError(AbstractEdgeError):
         self, predicted: Float[Array, "e D D"], T_i_j: Float[Array, "e D D"]
     ) -> Float[Array, "e k"]:
         """The tangent from the measured to the predicted motion."""
-        return lie.log(product(lie.inverse(T_i_j), predicted))
+        return lie.log(lie.between(T_i_j, predicted))
 
     def jacobian(
         self, predicted: Float[Array, "e D D"], error: Float[Array, "e k"]

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from jaxreg.averaging.steps.implicit import differentiable
 from jaxreg.averaging.steps.iterate import Iterated, TrustOf, WidthOf, held_width
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.linear.small import product
 
 
 def normal_equations(
@@ -63,10 +64,8 @@ def _linearised(graph: PoseGraph, T_world_i: Array) -> tuple[Array, Array]:
 
     That with respect to x_j is the identity.
     """
-    i, j = graph.edges[:, 0], graph.edges[:, 1]
-    T_j_i = product(lie.inverse(T_world_i)[j], T_world_i[i])
-    error = lie.log(lie.inverse(product(T_j_i, graph.T_i_j)))
-    return -lie.adjoint(T_j_i), error
+    T_j_i = lie.inverse(graph.predicted(T_world_i))
+    return -lie.adjoint(T_j_i), graph.tangent_errors(T_world_i)
 
 
 def precisions(

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import solve_laplacian
+from jaxreg.linear.small import product
 
 
 #: More of them are solved for by GMRES, which takes 200 products at most, one after the

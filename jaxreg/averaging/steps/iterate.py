@@ -11,14 +11,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core import loop
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.base import AveragingSolution, solution
-from jaxreg.averaging.measures import length_scale, weighted_mean
+from jaxreg.averaging.measures import weighted_mean
 from jaxreg.averaging.steps.implicit import differentiable
 from jaxreg.averaging.steps.rows import AbstractRows
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import solve_flow
 from jaxreg.linear.operator import divergence
+from jaxreg.linear.small import product
 
 
 #: Relative tolerance of a step's system: each step takes up what the last one left. On
@@ -150,7 +151,7 @@ def iterate(
     )
     limit = jnp.maximum(tolerance, 32 * jnp.finfo(T_start.dtype).eps)
     averaging = _Averaging(
-        graph, length_scale(graph), limit, width_of, trust_of, step_of, max_steps
+        graph, graph.length_scale, limit, width_of, trust_of, step_of, max_steps
     )
     begin = averaging.init((T_start, width_start))
     ended = loop.iterate(averaging, begin, max_steps=max_steps)

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import scipy.special
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core.quantile import nearest_rank
 from jaxreg.averaging.likelihood import explained
-from jaxreg.averaging.measures import length_scale, nearest_rank, num_held
 from jaxreg.averaging.steps.iterate import STILL
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.small import inverse
@@ -37,7 +37,7 @@ def first_width(
     width = (
         KERNEL_DEVIATIONS * 2**0.5 * explained(graph, T_world_i, alone=True).deviation
     )
-    return jnp.stack([width * length_scale(graph), width])
+    return jnp.stack([width * graph.length_scale, width])
 
 
 def annealed_width(
@@ -137,5 +137,5 @@ def chi2_median(dof: int) -> float:
 
 def spare_factor(graph: PoseGraph, count: Float[Array, ""]) -> Float[Array, ""]:
     """Edges over those that the poses do not use up, at most 4: poses take up noise."""
-    spare = jnp.maximum(count - (num_held(graph) - 1), count / 4)
+    spare = jnp.maximum(count - (graph.num_held - 1), count / 4)
     return jnp.where(count > 0, count / jnp.where(spare > 0, spare, 1), 1)

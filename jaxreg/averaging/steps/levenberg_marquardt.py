@@ -27,14 +27,15 @@ from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.restarts import ROUNDING
 from jaxreg._core.solver import LinearSolver
 from jaxreg._core.typing import Scalar
-from jaxreg.averaging.measures import length_scale, weighted_mean
+from jaxreg.averaging.measures import weighted_mean
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError
 from jaxreg.averaging.steps.iterate import STEP_TOLERANCE, nearby_rotation, pose_change
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.multigrid import Multigrid, multigrid
 from jaxreg.linear.operator import GraphLaplacian, divergence, matmul
+from jaxreg.linear.small import product
 from jaxreg.linear.solvers import MultigridCG
 from jaxreg.robust import AbstractKernel
 
@@ -64,7 +65,7 @@ class Problem(NamedTuple):
 
     def errors(self, T: Array) -> Array:
         """The error r of each edge."""
-        return self.error.value(_predicted(self.graph, T), self.graph.T_i_j)
+        return self.error.value(self.graph.predicted(T), self.graph.T_i_j)
 
     def _weighted(self, J: Array) -> Array:
         if self.precision.ndim == 2:
@@ -77,12 +78,13 @@ class Problem(NamedTuple):
 
     def normal(self, T: Array) -> tuple[Array, Array]:
         """J' Omega J `(e, k, k)` and J' Omega r `(e, k)` with respect to x_j - x_i."""
-        i, j = self.graph.edges[:, 0], self.graph.edges[:, 1]
-        T_i_world = lie.inverse(T)
-        predicted = product(T_i_world[i], T[j])
+        predicted = self.graph.predicted(T)
         r = self.error.value(predicted, self.graph.T_i_j)
         # A left tangent of both ends turns the predicted motion from the right.
-        J = matmul(self.error.jacobian(predicted, r), lie.adjoint(T_i_world)[j])
+        J = matmul(
+            self.error.jacobian(predicted, r),
+            lie.adjoint(lie.inverse(T))[self.graph.edges[:, 1]],
+        )
         WJ = self._weighted(J)
         force = jnp.sum(WJ * r[:, :, None], axis=-2)
         trust = self.trust(jnp.sum(r * self._weighted(r[..., None])[..., 0], axis=-1))
@@ -159,7 +161,7 @@ def minimise(
     """
     limit = jnp.maximum(tolerance, 4 * jnp.finfo(T_start.dtype).eps)
     cycle = no_cycle(problem, T_start) if cycle is None else cycle
-    length = length_scale(problem.graph)
+    length = problem.graph.length_scale
     descent = _Descent(problem, length, limit, max_steps, linear_solver)
     ended = iterate(descent, descent.init((T_start, cycle)), max_steps=max_steps)
     end = ended.state
@@ -257,10 +259,6 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
             num_steps=s.num_steps + 1,
             rows=with_row(s.rows, s.num_steps, change, no_width, trusted),
         )
-
-
-def _predicted(graph: PoseGraph, T: Array) -> Array:
-    return product(lie.inverse(T)[graph.edges[:, 0]], T[graph.edges[:, 1]])
 
 
 def _tangents(

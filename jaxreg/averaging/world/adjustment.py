@@ -21,17 +21,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
+from jaxreg._core.quantile import nearest_rank
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Scalar, StatusArray
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.gauge import average_graph, follow_graph
-from jaxreg.averaging.measures import deviations, length_scale, nearest_rank
+from jaxreg.averaging.measures import deviations
 from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM
 from jaxreg.averaging.world.points import ControlPoints
 from jaxreg.averaging.world.rigid_fit import FARTHEST, MEDIAN
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses, anchored, joined_priors
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 
 
 #: Adjustments, each with the trust that the one before leaves.
@@ -190,7 +191,7 @@ class Adjustment(eqx.Module):
     def _misfits(self, T: Array) -> tuple[Array, Array]:
         """Of priors, over their median; of points, likewise or in lengths."""
         known = self._priors(self._informed(T))
-        gap = product(lie.inverse(known.T_world_prior), T[known.frame])
+        gap = lie.between(known.T_world_prior, T[known.frame])
         error = lie.log(gap)
         assert known.information is not None
         turned = jnp.sum(known.information * error[:, None], axis=-1)
@@ -248,7 +249,7 @@ class Adjustment(eqx.Module):
 def shown_information(graph: PoseGraph, T: Array, trust: Array) -> Array:
     """Of the noise that the trusted edges leave."""
     d, k = graph.dim, lie.tangent_dim(graph.dim)
-    least = 1e-5 * jnp.stack([length_scale(graph), jnp.ones((), T.dtype)])
+    least = 1e-5 * jnp.stack([graph.length_scale, jnp.ones((), T.dtype)])
     noise = jnp.maximum(deviations(graph, T, trust), least)
     each = jnp.concatenate([jnp.full(d, noise[0]), jnp.full(k - d, noise[1])])
     return jnp.broadcast_to(jnp.diag(each**-2), (graph.num_edges, k, k))

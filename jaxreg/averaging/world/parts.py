@@ -12,7 +12,7 @@ from jaxreg.averaging.world.points import ControlPoints
 from jaxreg.averaging.world.rigid_fit import CHOICES, likeliest_place, spans
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses
-from jaxreg.graph.pose_graph import product
+from jaxreg.linear.small import product
 
 
 class Brought(NamedTuple):

@@ -17,7 +17,6 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
-from jaxreg.averaging.measures import length_scale
 from jaxreg.averaging.world.adjustment import Adjustment
 from jaxreg.averaging.world.arguments import Known
 from jaxreg.averaging.world.parts import brought
@@ -30,7 +29,7 @@ from jaxreg.graph.anchored import (
     without_priors,
 )
 from jaxreg.graph.hang import with_hung
-from jaxreg.graph.pose_graph import PoseGraph, product
+from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import components
 
 
@@ -48,7 +47,7 @@ def average_known(
     """`average` with priors, fixed frames and control points, all checked."""
     if init is not None and known.origin is not None:
         init = init.at[:, :-1, -1].add(-jnp.asarray(known.origin, init.dtype))
-    found = _averaged(graph, method, known, init, key, length_scale(graph))
+    found = _averaged(graph, method, known, init, key, graph.length_scale)
     if known.origin is None:
         return found
     in_world = found.placed & (found.status != Status.DEGENERATE)
@@ -148,7 +147,7 @@ def _of_parts(
     label = components(graph.edges, graph.weight, graph.num_poses)
     frame = jnp.arange(graph.num_poses, dtype=jnp.int32)
     hung = (label == frame) & (label != label[0])
-    T_0_i = None if init is None else product(lie.inverse(init[:1]), init)
+    T_0_i = None if init is None else lie.between(init[0], init)
     found = average_graph(with_hung(graph, hung, T_0_i), method, init, key)
     trust = found.edge_weight[: graph.num_edges]
     return eqx.tree_at(lambda s: s.edge_weight, found, trust), label
