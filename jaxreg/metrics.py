@@ -7,11 +7,9 @@ frame (the gauge), so both sets are first brought into one.
 
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation
 
 from jaxreg._core.checks import (
     as_float_array,
@@ -20,6 +18,7 @@ from jaxreg._core.checks import (
     check_mask,
     shown,
 )
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.geometry.kabsch import kabsch
@@ -108,7 +107,7 @@ def rotation_errors(
     return _rotation_errors(*_checked(T_world_i, T_true_i, align, mask))
 
 
-@eqx.filter_jit
+@kept_program
 def _rotation_errors(
     T_world_i: Array, T_true_i: Array, align: Align, mask: Array
 ) -> Array:
@@ -127,7 +126,7 @@ def translation_errors(
     return _translation_errors(*_checked(T_world_i, T_true_i, align, mask))
 
 
-@eqx.filter_jit
+@kept_program
 def _translation_errors(
     T_world_i: Array, T_true_i: Array, align: Align, mask: Array
 ) -> Array:
@@ -158,7 +157,7 @@ def relative_errors(
     return _relative_errors(T[::delta], T_true[::delta])
 
 
-@eqx.filter_jit
+@kept_program
 def _relative_errors(T: Array, T_true: Array) -> tuple[Array, Array]:
     found = lie.between(T[:-1], T[1:])
     gap = lie.between(lie.between(T_true[:-1], T_true[1:]), found)
@@ -213,7 +212,7 @@ def chordal_objective(graph: PoseGraph, T_world_i: ArrayLike) -> Float[Array, ""
     return _chordal_objective(one, check_poses(T_world_i, "T_world_i", one))
 
 
-@eqx.filter_jit
+@kept_program
 def _chordal_objective(graph: PoseGraph, T_world_i: Array) -> Array:
     kappa, tau = chordal_weights(graph)
     i, j = graph.edges[:, 0], graph.edges[:, 1]
@@ -306,6 +305,8 @@ def _motions_by_pair(
 
 
 def _coincidence(T: np.ndarray, T_true: np.ndarray, information: np.ndarray) -> float:
+    from scipy.spatial.transform import Rotation  # at use: it is slow to import
+
     gap = np.linalg.inv(T_true) @ T
     xyzw = Rotation.from_matrix(gap[:3, :3]).as_quat(canonical=True)
     e = np.concatenate([gap[:3, 3], xyzw[:3]])

@@ -40,6 +40,15 @@ def _bounded_number_of_live_programs() -> Iterator[None]:
     gc.freeze()
 
 
+@pytest.fixture(autouse=True)
+def _programs_are_traced_anew() -> Iterator[None]:
+    """What a test replaces in the package is no part of the key of a kept program."""
+    yield
+    from jaxreg._core.programs import keep_programs
+
+    keep_programs(None)
+
+
 @pytest.fixture(scope="module")
 def fully_compiled() -> Iterator[None]:
     """For modules of large problems, whose time is that of computing."""

@@ -1,9 +1,11 @@
-"""Compiled programs kept on disk, so that the next process need not compile them."""
+"""Programs kept on disk, so that the next process need not make them."""
 
 import os
 from pathlib import Path
 
 import jax
+
+from jaxreg._core.programs import keep_programs
 
 
 # Programs that compile in less are compiled again.
@@ -11,7 +13,11 @@ _LEAST_SECONDS = 0.05
 
 
 def cache(folder: str | Path | None = None) -> Path:
-    """Keeps compiled programs in a folder and takes them from there: JAX's own cache.
+    """Keeps programs in a folder and takes them from there.
+
+    Compiled ones in JAX's own cache, and traced ones beside it where `flatbuffers` is
+    installed (`jaxreg[app]` has it): then a call is neither traced nor compiled. Those
+    of methods with parts of other code than this package are compiled ones only.
 
     Call it before the first program is compiled. It sets JAX's configuration for the
     whole process, and so nothing but a call of it does.
@@ -31,6 +37,8 @@ def cache(folder: str | Path | None = None) -> Path:
     """
     named = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if folder is None and named:  # JAX keeps them there without being told again
+        folder = Path(named).absolute()
+        keep_programs(folder / "programs" if _may_keep(folder) else None)
         return Path(named)
     if folder is None:
         root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -45,7 +53,16 @@ def cache(folder: str | Path | None = None) -> Path:
         )
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST_SECONDS)
+    keep_programs(folder / "programs")
     return folder
+
+
+def _may_keep(folder: Path) -> bool:
+    """Whether a folder is there for this user alone, or can be made."""
+    try:
+        return not folder.exists() or _is_mine(folder)
+    except OSError:
+        return False
 
 
 def _is_mine(folder: Path) -> bool:

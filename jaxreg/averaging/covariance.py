@@ -1,11 +1,11 @@
 """How well a graph determines the poses that were averaged from it."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import check_count
+from jaxreg._core.programs import kept_program
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.measures import deviations
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
@@ -64,7 +64,7 @@ def pose_covariances(
     return covariances.at[jnp.asarray(frames, jnp.int32)].set(0)
 
 
-@eqx.filter_jit
+@kept_program
 def _covariances(
     graph: PoseGraph, solution: AveragingSolution
 ) -> Float[Array, "v k k"]:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ import scipy.special
 
 from jaxreg._core.arrays import widened
 from jaxreg._core.checks import check_count
+from jaxreg._core.programs import kept_program
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.measures import deviations
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
@@ -170,7 +170,7 @@ class _Linearised(NamedTuple):
     normal: Any  # (v k, v k), None of many frames
 
 
-@eqx.filter_jit
+@kept_program
 def _linearised(
     graph: PoseGraph, T: jax.Array, trusted: jax.Array, few: bool
 ) -> _Linearised:

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
 from jaxreg._core.arrays import cast_floats
+from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
@@ -50,7 +51,7 @@ class _Gauge(NamedTuple):
     finite: Array
 
 
-@eqx.filter_jit
+@kept_program
 def _prepared(
     graph: PoseGraph, method: AbstractAverager, init: Float[Array, "v D D"] | None
 ) -> tuple[PoseGraph, AbstractAverager, Float[Array, "v D D"] | None, _Gauge]:
@@ -70,7 +71,7 @@ def _prepared(
     return reduced, method, T_start, _Gauge(T_world_0, unit, component, finite)
 
 
-@eqx.filter_jit
+@kept_program
 def _placed(
     out: AveragingSolution, gauge: _Gauge, present: Bool[Array, " v"] | None
 ) -> AveragingSolution:

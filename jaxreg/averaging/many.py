@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Iterator, Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import as_float_array, check_rigid, is_concrete
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
@@ -161,7 +161,7 @@ def _padded(
     return batch, present, starts
 
 
-@eqx.filter_jit
+@kept_program
 def _average_lanes(
     method: AbstractAverager, lanes: _Lanes, batch_size: int, devices: Devices | None
 ) -> AveragingSolution:

@@ -25,6 +25,7 @@ from jaxreg._core.checks import (
     check_positive,
 )
 from jaxreg._core.loop import iterate
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key, Mask, Motion, Points, Scalar
 from jaxreg.cloud import (
     PointCloud,
@@ -157,7 +158,7 @@ class ICP(AbstractRegistrar):
             return thin(points, mask, self.max_points)
         return thin(points, mask, self.max_points, self.soft.num, fading=True)
 
-    @eqx.filter_jit
+    @kept_program
     def iteration(
         self, source: object, target: object, init: object = None
     ) -> tuple[Descending, Descent]:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
@@ -68,7 +69,7 @@ def finish(
     )
 
 
-@eqx.filter_jit
+@kept_program
 def _solution(
     scans: PreparedScans,
     motions: RelativeMotions,

@@ -5,13 +5,13 @@ hold, so two bodies that are not held by one pair may be by all of theirs togeth
 then are one; and so on.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from jaxreg._core import control
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
 from jaxreg.graph.trees import components
@@ -20,7 +20,7 @@ from jaxreg.multiview.place import Placement, in_main_body
 from jaxreg.multiview.prepare import PreparedScans
 
 
-@eqx.filter_jit
+@kept_program
 def slipping(
     scans: PreparedScans, placement: Placement, least: Scalar
 ) -> Bool[Array, " v"]:

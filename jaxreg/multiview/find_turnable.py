@@ -4,17 +4,17 @@ A pair of which another mode is as likely as the best settles nothing. Pairs tha
 are settled make bodies; scans that only the others join to them may be elsewhere.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from jaxreg._core.programs import kept_program
 from jaxreg.graph.trees import components
 from jaxreg.multiview.place import Placement, in_main_body, joins
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.particle.conclude import RIVAL_MARGIN
 
 
-@eqx.filter_jit
+@kept_program
 def turnable(motions: RelativeMotions, placement: Placement) -> Bool[Array, " v"]:
     """`(v,)` scans that no settled pairs join to the main body of their part.
 

@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxreg._core import control
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.local import LocalOptimiser, Rest, at_rest
 from jaxreg.matching import Problem
@@ -18,7 +19,7 @@ from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.neighbours import exact_index
 
 
-@eqx.filter_jit
+@kept_program
 def follow_points(
     scans: PreparedScans,
     motions: RelativeMotions,

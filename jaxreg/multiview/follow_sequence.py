@@ -5,13 +5,13 @@ finds most pairs of a sequence in a fraction of a search. What it finds is trust
 once only if it is as likely as no chance is; else it competes with the search.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import cast_floats
+from jaxreg._core.programs import kept_program
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import NO_EVIDENCE, PlaneToPlane, Problem
@@ -29,7 +29,7 @@ SURE = 4.0
 _STEPS, _POLISH = 24, 8
 
 
-@eqx.filter_jit
+@kept_program
 def descended(
     method: AbstractRegistrar,
     scans: PreparedScans,

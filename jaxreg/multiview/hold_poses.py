@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.geometry import lie
@@ -81,7 +82,7 @@ class Held(eqx.Module):
         return eqx.tree_at(lambda s: s.T_world_i, solution, T)
 
 
-@eqx.filter_jit
+@kept_program
 def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
     """With the held poses; each other scan follows the held one nearest to it."""
     ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
@@ -101,7 +102,7 @@ def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
     return eqx.tree_at(lambda p: (p.T_world_i, p.part), found, (T, part))
 
 
-@eqx.filter_jit
+@kept_program
 def _contracted(
     hold: Held, before: Placement, motions: RelativeMotions
 ) -> RelativeMotions:
@@ -119,7 +120,7 @@ def _contracted(
     )
 
 
-@eqx.filter_jit
+@kept_program
 def _expanded(hold: Held, before: Placement, nodes: Placement) -> Placement:
     """Poses of the scans by those of the nodes."""
     beside = nodes.together(hold.node, jnp.zeros_like(hold.node))

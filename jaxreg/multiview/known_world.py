@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager, Correntropy
@@ -109,7 +110,7 @@ class KnownWorld(eqx.Module):
         return eqx.tree_at(lambda s: s.T_world_i, solution, T)
 
 
-@eqx.filter_jit
+@kept_program
 def _placed(
     known: Known,
     scans: PreparedScans,

@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar, StatusArray
 from jaxreg.averaging import (
     AbstractAverager,
@@ -87,7 +88,7 @@ class Placement(eqx.Module):
         return self.part[i] == self.part[j]
 
 
-@eqx.filter_jit
+@kept_program
 def place(
     motions: RelativeMotions,
     num_scans: int,

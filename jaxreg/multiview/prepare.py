@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motions, Scalar
 from jaxreg.cloud import (
@@ -155,7 +156,7 @@ def prepare_scan(
     return cloud, table, exact, mean, spacing
 
 
-@eqx.filter_jit
+@kept_program
 def prepare_scans(
     method: AbstractRegistrar,
     points: Float[Array, "v n d"],

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core import control
 from jaxreg._core.arrays import cast_floats
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
 from jaxreg.geometry import lie
@@ -75,7 +76,7 @@ def wide_unless_given(averaging: AbstractAverager | None) -> AbstractAverager:
     return averaging
 
 
-@eqx.filter_jit
+@kept_program
 def _updated(before: Placement, after: Placement) -> Placement:
     """The later poses of the scans that both hold, in the earlier frames.
 
@@ -95,7 +96,7 @@ def _updated(before: Placement, after: Placement) -> Placement:
     return eqx.tree_at(lambda p: (p.T_world_i, p.part), before, (T, first))
 
 
-@eqx.filter_jit
+@kept_program
 def measured(
     scans: PreparedScans, placement: Placement, least: Scalar, *, exact: bool
 ) -> RelativeMotions:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxreg._core import control
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key, Progress, Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.threads import map_in_threads
@@ -171,7 +171,7 @@ class Rounds:
         return trusted | trusted.T, likely + likely.T, np.asarray(placement.part)
 
 
-@eqx.filter_jit
+@kept_program
 def _prospects(
     method: AbstractRegistrar,
     averaging: AbstractAverager | None,

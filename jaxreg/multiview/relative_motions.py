@@ -8,6 +8,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.brief import BriefModule
+from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.matching import NO_EVIDENCE
@@ -62,7 +63,7 @@ class RelativeMotions(BriefModule):
         parts = self.T_i_j, self.overlap, self.log_evidence, self.inlier_rmse
         return RelativeMotions(self.pairs, *(x[e, mode][:, None] for x in parts))
 
-    @eqx.filter_jit
+    @kept_program
     def rows(self, rows: Int[Array, " r"]) -> "RelativeMotions":
         """Some of them."""
         return jax.tree.map(lambda x: x[rows], self)
@@ -162,7 +163,7 @@ def _turned(T: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.sum(T[..., :-1, :-1] * points[..., None, :], axis=-1)
 
 
-@eqx.filter_jit
+@kept_program
 def relative_motions(
     method: AbstractRegistrar,
     scans: PreparedScans,

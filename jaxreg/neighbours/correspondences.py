@@ -4,6 +4,7 @@ import equinox as eqx
 from jaxtyping import Array
 
 from jaxreg._core.checks import as_float_array, check_motion, check_pair
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import ArrayLike
 from jaxreg.geometry import lie
 from jaxreg.neighbours.auto import exact_index
@@ -70,7 +71,7 @@ def correspondences(
     return _find(source, target, T, max_distance, source_mask, target_mask)
 
 
-@eqx.filter_jit
+@kept_program
 def _find(
     source: Array,
     target: Array,

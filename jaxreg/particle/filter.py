@@ -30,6 +30,7 @@ from jaxreg._core.checks import (
     check_parts,
     check_shares,
 )
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key, Motion
 from jaxreg.local import AbstractStep, GaussNewton
 from jaxreg.matching import LIKELY, AbstractResidual, PointToPlane, Problem
@@ -160,7 +161,7 @@ class ParticleFilter(AbstractFilter):
             drawn = most_look_ups(self.num_prior, self.prior_steps, self.batch_size)
         return drawn + self.num_particles * self.num_times * (self.inner_steps + 1)
 
-    @eqx.filter_jit
+    @kept_program
     def iteration(
         self,
         source: object,

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Hashable, Iterator
 from typing import TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Progress
 from jaxreg.batching.devices import Devices, map_rows, spread_rows
 from jaxreg.batching.padding import (
@@ -184,7 +184,7 @@ def _over_cores(
     return map_in_threads(run, range(0, num, chunk), cores)
 
 
-@eqx.filter_jit
+@kept_program
 def _register_rows(
     method: AbstractRegistrar,
     pairs: _Pairs,

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import overload
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AbstractMesh, Mesh
@@ -21,6 +20,7 @@ from jaxreg._core.checks import (
     is_concrete,
 )
 from jaxreg._core.log import log_solution
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.batching.devices import chosen_devices
 from jaxreg.batching.padding import (
@@ -222,7 +222,7 @@ def _rounded_up(pair: tuple[Array, ...]) -> tuple[Array, ...]:
     return tuple(stacked([x], rounded_up(len(x)))[0] for x in pair)
 
 
-@eqx.filter_jit
+@kept_program
 def _register_one(
     method: AbstractRegistrar,
     pair: tuple[Array, ...],

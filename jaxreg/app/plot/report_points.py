@@ -7,12 +7,15 @@ itself, so that "before", "after" and every mode share one copy of the points.
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from jaxreg.app.merge import merge_scans
+
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 
 MAX_POINTS = 110_000
@@ -54,6 +57,8 @@ def page_points(
         component: `(v,)` those that share one number share a frame, -1 has none.
         camera: `(3, 3)` rows right, up and towards the viewer; None for 2D.
     """
+    from scipy.spatial import KDTree  # at use: a start takes a tenth longer by it
+
     step = 1 + sum(map(len, scans)) // _MAX_REFERENCE
     full = [s[np.isfinite(s).all(axis=1)][::step].astype(np.float64) for s in scans]
     budget = _budget(np.array([len(x) for x in full]), MAX_POINTS)
@@ -120,7 +125,7 @@ def _thin(x: np.ndarray, num: int) -> np.ndarray:
     return merge_scans([x], np.eye(x.shape[1] + 1)[None], np.ones(1, bool), num)[0]
 
 
-def _normals(tree: KDTree, x: np.ndarray) -> np.ndarray:
+def _normals(tree: "KDTree", x: np.ndarray) -> np.ndarray:
     _, index = tree.query(x, k=min(_NEIGHBOURS, tree.n), workers=-1)
     near = tree.data[index.reshape(len(x), -1)]
     near = near - near.mean(axis=1, keepdims=True)
@@ -158,7 +163,7 @@ def _light(normal: np.ndarray) -> np.ndarray:
 
 
 def _distances(
-    trees: list[KDTree],
+    trees: list["KDTree"],
     world: list[np.ndarray],
     T_world_i: np.ndarray,
     component: np.ndarray,
@@ -189,6 +194,6 @@ def _distances(
     return [c.astype(np.uint8) for c in codes], far
 
 
-def _corners(tree: KDTree, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _corners(tree: "KDTree", T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     moved = _move(T, np.asarray(tree.data))
     return moved.min(axis=0), moved.max(axis=0)

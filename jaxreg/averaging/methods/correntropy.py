@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxreg._core import control
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_parts
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.likelihood import (
@@ -91,7 +92,7 @@ class Correntropy(AbstractAverager):
         T_start = starting_poses(self.initialiser, graph, init, key)
         return self._small(graph, T_start)
 
-    @eqx.filter_jit
+    @kept_program
     def _small(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"]
     ) -> AveragingSolution:
@@ -136,7 +137,7 @@ class Correntropy(AbstractAverager):
         end = gauss_newton_gradients(graph, end, gaussian_trust, followed)
         return solution_of(graph, _or_start(graph, end, T_start))
 
-    @eqx.filter_jit
+    @kept_program
     def _large(
         self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
     ) -> AveragingSolution:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_positive
 from jaxreg._core.loop import AbstractIteration, iterate
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key, Scalar
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -62,7 +63,7 @@ class LowRankSparse(AbstractAverager):
         check_positive(self, "threshold")
         check_not_negative(self, "tolerance")
 
-    @eqx.filter_jit
+    @kept_program
     def solve(
         self,
         graph: PoseGraph,

@@ -17,6 +17,7 @@ from jaxreg._core.checks import (
     check_parts,
     check_positive,
 )
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.measures import frobenius, weighted_mean
@@ -79,7 +80,7 @@ class MCC(AbstractAverager):
             graph, starting_poses(self.initialiser, graph, init, key)
         )
 
-    @eqx.filter_jit
+    @kept_program
     def _from_start(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"]
     ) -> AveragingSolution:

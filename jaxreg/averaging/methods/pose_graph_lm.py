@@ -15,6 +15,7 @@ from jaxreg._core.checks import (
     check_parts,
     check_positive,
 )
+from jaxreg._core.programs import kept_program
 from jaxreg._core.solver import LinearSolver, Solver
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
@@ -112,7 +113,7 @@ class PoseGraphLM(AbstractAverager):
                 "own; give it to that, or leave out one of both."
             )
 
-    @eqx.filter_jit
+    @kept_program
     def solve(
         self,
         graph: PoseGraph,

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_parts
+from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
@@ -75,7 +76,7 @@ class RiemannianStaircase(AbstractAverager):
         check_counts(self, max_steps=1, max_rank=2)
         check_not_negative(self, "tolerance")
 
-    @eqx.filter_jit
+    @kept_program
     def solve(
         self,
         graph: PoseGraph,

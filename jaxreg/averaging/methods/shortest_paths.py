@@ -1,8 +1,8 @@
 """Poses chained along the shortest paths from frame 0: the start of least squares."""
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -24,7 +24,7 @@ class ShortestPaths(AbstractAverager):
     Gradients: none; asking for them raises a TypeError.
     """
 
-    @eqx.filter_jit
+    @kept_program
     def solve(
         self,
         graph: PoseGraph,

@@ -1,8 +1,8 @@
 """Poses chained along a spanning tree: the start of robust methods."""
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -23,7 +23,7 @@ class SpanningTree(AbstractAverager):
     Gradients: none; asking for them raises a TypeError.
     """
 
-    @eqx.filter_jit
+    @kept_program
     def solve(
         self,
         graph: PoseGraph,

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import check_counts, is_concrete
 from jaxreg._core.loop import AbstractIteration, iterate
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
     AbstractAverager,
@@ -99,7 +100,7 @@ class _Search(AbstractIteration[Key | None, _Best]):
     hypotheses: int
     rounds: int
 
-    @eqx.filter_jit
+    @kept_program
     def init(self, start: Key | None) -> _Best:
         """The odds at each scale, and the best of their trees.
 
@@ -159,7 +160,7 @@ class _Search(AbstractIteration[Key | None, _Best]):
         )
 
 
-@eqx.filter_jit
+@kept_program
 def _by_trees(graph: PoseGraph) -> AveragingSolution:
     graph = jax.lax.stop_gradient(graph)
     args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
@@ -172,12 +173,12 @@ def _by_trees(graph: PoseGraph) -> AveragingSolution:
     return solution(graph, T[_likeliest(graph, T)[0]], num_steps=0)
 
 
-@eqx.filter_jit
+@kept_program
 def _searched(search: _Search, best: _Best) -> _Best:
     return iterate(search, best, max_steps=search.rounds).state
 
 
-@eqx.filter_jit
+@kept_program
 def _with_trust(graph: PoseGraph, best: _Best) -> AveragingSolution:
     trust = jnp.where(graph.weight > 0, jax.nn.sigmoid(best.odds[best.scale]), 0)
     return solution(graph, best.T, edge_weight=trust, num_steps=best.num_steps)

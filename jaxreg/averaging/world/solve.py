@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
@@ -75,7 +76,7 @@ def average_in_world(
     return _averaged(graph, method, known, init, None, unit)
 
 
-@eqx.filter_jit
+@kept_program
 @control.over_devices
 def _averaged(
     graph: PoseGraph,

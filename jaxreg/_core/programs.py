@@ -1,0 +1,186 @@
+"""Programs kept as they were traced, so that the next process need not trace them.
+
+Tracing and lowering are two thirds of a start whose programs are compiled. `jax.export`
+writes what they give; JAX's own cache keeps what the compiler makes of it.
+"""
+
+import functools
+import platform
+import warnings
+from collections.abc import Callable
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxreg._core.checks import is_concrete
+from jaxreg._core.program_files import Hole, digest, pickled, read, write
+
+
+P = ParamSpec("P")
+Out = TypeVar("Out")
+
+
+def kept_program(function: Callable[P, Out]) -> Callable[P, Out]:
+    """`equinox.filter_jit`; after `jaxreg.cache()` its programs are kept on disk.
+
+    Those of calls from outside of transformations, with arrays of one device and with
+    methods of this package: of other code a key cannot tell when it changes.
+    """
+    plain = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> Out:
+        if _STORE is None:
+            return plain(*args, **kwargs)
+        program = _STORE.program(function, args, kwargs)
+        return plain(*args, **kwargs) if program is None else program(args, kwargs)
+
+    return call
+
+
+def keep_programs(folder: Path | None) -> None:
+    """Keeps programs there from now on; None: no longer.
+
+    Needs `flatbuffers`, by which `jax.export` writes: without it nothing is kept.
+    """
+    global _STORE
+    able = find_spec("flatbuffers") is not None
+    _STORE = _Store(folder) if folder is not None and able else None
+
+
+class _Program(NamedTuple):
+    """A traced program, and what its answer looks like."""
+
+    run: Callable[..., Any]
+    skeleton: Any  # the answer with holes for arrays
+
+    def __call__(self, args: Any, kwargs: Any) -> Any:
+        leaves = self.run(*jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array)))
+        holes, rest = eqx.partition(self.skeleton, lambda x: isinstance(x, Hole))
+        return eqx.combine(jax.tree.unflatten(jax.tree.structure(holes), leaves), rest)
+
+
+class _Store:
+    """A folder of programs, and those that this process has met."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self._met: dict[Any, _Program | None] = {}
+        self._told = False
+
+    def program(self, function: Callable, args: Any, kwargs: Any) -> _Program | None:
+        """The program of a call; None if it cannot be kept."""
+        arrays, static = eqx.partition((args, kwargs), eqx.is_array)
+        leaves, places = jax.tree.flatten(arrays)
+        settings = _settings()
+        if settings is None or not all(map(_is_usual, leaves)):
+            return None
+        rest, others = jax.tree.flatten(static)
+        holes = tuple(map(_hole, leaves))
+        # With their types, as 1 is True.
+        typed = tuple((type(x), x) for x in rest)
+        key = (function, places, others, typed, holes, settings)
+        try:
+            if key in self._met:
+                return self._met[key]
+        except TypeError:  # something static has no hash
+            return None
+        asked = eqx.combine(jax.tree.unflatten(places, holes), static)
+        self._met[key] = self._made(function, asked, args, kwargs, settings)
+        return self._met[key]
+
+    def _made(
+        self, function: Callable, asked: Any, args: Any, kwargs: Any, settings: tuple
+    ) -> _Program | None:
+        """From the folder, else traced and put there."""
+        who = function.__module__, function.__qualname__
+        try:
+            name = digest(pickled((*who, asked)), *settings, *_code())
+        except Exception:  # noqa: BLE001  whatever the pickling of an object raises
+            return None
+        path = self.folder / f"{name}.program"
+        found = read(path)
+        if found is None:
+            found = _exported(function, args, kwargs)
+            if found is None:
+                return None
+            self._write(path, *found)
+        exported, skeleton = found
+        return _Program(jax.jit(exported.call), skeleton)
+
+    def _write(self, path: Path, exported: Any, skeleton: Any) -> None:
+        """A folder that takes nothing is told of once."""
+        try:
+            write(path, exported, skeleton)
+        except OSError as err:
+            if not self._told:
+                told = f"{self.folder}: programs cannot be kept: {err}"
+                warnings.warn(told, stacklevel=2)
+            self._told = True
+
+
+_STORE: _Store | None = None
+
+
+def _hole(x: Any) -> Hole:
+    return Hole(tuple(x.shape), str(x.dtype), bool(getattr(x, "weak_type", False)))
+
+
+def _is_usual(x: Any) -> bool:
+    """Whether an array is known, and on one device of the kind that is the default."""
+    if not is_concrete(x):
+        return False
+    devices = x.devices() if isinstance(x, jax.Array) else ()
+    kinds = {device.platform for device in devices}
+    return len(devices) < 2 and kinds <= {jax.default_backend()}
+
+
+def _settings() -> tuple[str, ...] | None:
+    """Of JAX, on which a program depends; None where programs are not to be kept."""
+    config: Any = jax.config  # its names are made as it runs
+    if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs:
+        return None
+    return (
+        str(jnp.result_type(float)),
+        str(config.jax_default_matmul_precision),
+        str(config.jax_default_prng_impl),
+        str(config.jax_threefry_partitionable),
+        jax.default_backend(),
+    )
+
+
+@functools.cache
+def _code() -> tuple[str, ...]:
+    """Versions, and the code of this package itself, which may be a checkout."""
+    root = Path(__file__).parents[1]
+    files = sorted(root.rglob("*.py"))
+    code = digest(*(part for p in files for part in (str(p), p.read_bytes())))
+    libraries = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "optimistix", "numpy")
+    versions = (metadata.version(name) for name in libraries)
+    return code, platform.python_version(), *versions
+
+
+def _exported(function: Callable, args: Any, kwargs: Any) -> tuple[Any, Any] | None:
+    """The traced program and the skeleton of its answer; None if it cannot be kept."""
+    from jax import export
+
+    arrays, static = eqx.partition((args, kwargs), eqx.is_array)
+    leaves, places = jax.tree.flatten(arrays)
+    skeletons = []
+
+    def flat(*leaves: Any) -> list[Any]:
+        args, kwargs = eqx.combine(jax.tree.unflatten(places, leaves), static)
+        arrays, rest = eqx.partition(function(*args, **kwargs), eqx.is_array)
+        skeletons.append(eqx.combine(jax.tree.map(lambda _: Hole(), arrays), rest))
+        return jax.tree.leaves(arrays)
+
+    flat.__name__ = function.__name__
+    try:
+        return export.export(jax.jit(flat))(*leaves), skeletons[-1]
+    except Exception:  # noqa: BLE001  `filter_jit` then raises what a user did wrong
+        return None
