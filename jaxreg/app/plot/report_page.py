@@ -1,5 +1,7 @@
 """The file: one HTML page that holds its style, its programs and its data."""
 
+import base64
+import gzip
 import html
 import json
 from importlib import resources
@@ -12,6 +14,7 @@ from jaxreg.io.errors import MissingExtraError
 
 
 _SCRIPTS = (
+    "unpack.js",
     "base.js",
     "view.js",
     "section.js",
@@ -40,8 +43,8 @@ def write_page(path: str | Path, title: str, data: dict[str, Any]) -> None:
     parts = {
         "TITLE": html.escape(title),
         "STYLE": (folder / "report.css").read_text("utf-8"),
-        "PLOTLY": _in_script(_plotly()),
-        "DATA": _in_json(data),
+        "PLOTLY": _packed(_plotly()),
+        "DATA": _packed(_in_json(data)),
         "PROGRAM": "\n".join((folder / s).read_text("utf-8") for s in _SCRIPTS),
     }
     # Split, not replaced one after another: what is put in is never searched.
@@ -59,11 +62,13 @@ def _plotly() -> str:
     return get_plotlyjs()
 
 
-def _in_script(code: str) -> str:
-    return code.replace("</script", "<\\/script")
-
-
 def _in_json(data: dict[str, Any]) -> str:
-    """JSON that no text in it can end: a file may be named `</script>`."""
-    text = json.dumps(without_nan(data), allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    return json.dumps(without_nan(data), allow_nan=False, separators=(",", ":"))
+
+
+def _packed(text: str) -> str:
+    """Text as gzip in base64: in a page it takes two fifths of the room.
+
+    Nothing in it can end its element; a file may be named `</script>`.
+    """
+    return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode("ascii")

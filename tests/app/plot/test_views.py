@@ -84,7 +84,7 @@ def test_solutions_are_drawn(
     assert len(picture.axes) == panels
     assert picture._repr_png_().startswith(b"\x89PNG")
     views.write_page(tmp_path / "a.html", solution, *data)
-    assert "application/json" in (tmp_path / "a.html").read_text("utf-8")
+    assert 'id="data"' in (tmp_path / "a.html").read_text("utf-8")
 
 
 def test_data_that_do_not_fit_are_refused(tmp_path: Path):

@@ -1,7 +1,7 @@
 // Shared by all parts of the page: the data, the state, and small helpers. Text that
 // comes from files reaches the page as text nodes only, never as markup.
 
-const DATA = JSON.parse(document.getElementById("data").textContent);
+const DATA = JSON.parse(await unpacked("data"));
 const FLAT = DATA.dim === 2;
 const SCANS = DATA.kind === "scans";
 const CONFIG = { responsive: true, displayModeBar: false, scrollZoom: true };

@@ -4,15 +4,17 @@ let POINTS = null;
 
 function readPoints() {
   const p = DATA.points;
-  const xyz = decode(p.xyz, Int16Array);
+  const steps = decode(p.xyz, Int16Array);
   const light = decode(p.light, Uint8Array);
   const distance = decode(p.distance, Uint8Array);
   let start = 0;
   return p.count.map((n, i) => {
     const local = new Float64Array(n * DATA.dim);
+    const at = Array(DATA.dim).fill(0);
     for (let k = 0; k < local.length; k++) {
       const axis = k % DATA.dim;
-      local[k] = p.offset[i][axis] + p.scale[i] * xyz[start * DATA.dim + k];
+      at[axis] += steps[start * DATA.dim + k];
+      local[k] = p.offset[i][axis] + p.scale[i] * at[axis];
     }
     const part = {
       n,
