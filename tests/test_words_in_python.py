@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import jaxreg as jr
-from jaxreg import io
 from jaxreg._core.status import counted
 
 
@@ -27,12 +26,6 @@ def test_batches_tell_how_many_have_each_status():
 
 def test_a_status_prints_its_name():
     assert f"{jr.Status(0)}" == "CONVERGED"
-
-
-def test_clouds_of_other_libraries_name_their_converter():
-    cloud = io.to_trimesh(np.eye(3))
-    with pytest.raises(TypeError, match=r"jaxreg\.io\.points_of\(source\)"):
-        jr.register(cloud, np.eye(3), jr.ICP())
 
 
 class _OnDevice:

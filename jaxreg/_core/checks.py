@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from jaxreg._core.host_arrays import as_host_array as as_host_array
 from jaxreg._core.host_arrays import as_host_numbers as as_host_numbers
+from jaxreg._core.host_arrays import held_points as held_points
 from jaxreg._core.typing import Key
 
 
@@ -33,7 +34,8 @@ def as_float_array(x: object, name: str) -> Array:
     anything that is not a number are refused.
 
     Args:
-        x: an array of any library, nested lists, or a JAX array (also a tracer).
+        x: an array of any library, nested lists, a JAX array (also a tracer), or a
+            cloud or mesh of Open3D or trimesh, which stands for its points.
         name: how error messages call the argument.
     """
     if not isinstance(x, jax.Array):

@@ -1,12 +1,27 @@
 """Arrays of other libraries as NumPy arrays, and words on those that cannot be."""
 
+from typing import Any
+
 import jax
 import numpy as np
 
 
+def held_points(x: Any) -> Any:
+    """The points of a cloud or mesh of Open3D or trimesh; all else as it is."""
+    if type(x).__module__.partition(".")[0] not in ("open3d", "trimesh"):
+        return x
+    for part in ("point", "vertex"):  # Open3D's tensor kind
+        if hasattr(x, part):
+            return getattr(x, part).positions.cpu().numpy()
+    for part in ("points", "vertices"):
+        if hasattr(x, part):
+            return np.asarray(getattr(x, part))
+    return x
+
+
 def as_host_array(x: object, name: str) -> np.ndarray:
-    """Converts what `numpy.asarray` or DLPack takes to a NumPy array of numbers."""
-    _refuse_geometry(x, name)
+    """What `numpy.asarray` or DLPack takes, or a cloud, as a NumPy array of numbers."""
+    x = held_points(x)
     try:
         if hasattr(x, "__dlpack__") and not isinstance(x, np.ndarray | jax.Array):
             x = np.from_dlpack(x)  # pyright: ignore[reportArgumentType]
@@ -22,18 +37,6 @@ def as_host_array(x: object, name: str) -> np.ndarray:
         hint = " Files are read by jaxreg.io." if x.dtype.kind in "SUV" else ""
         raise TypeError(f"{name}: wanted numbers, found dtype {x.dtype}.{hint}")
     return x
-
-
-def _refuse_geometry(x: object, name: str) -> None:
-    """Names the converter of clouds and meshes of Open3D and trimesh."""
-    package = type(x).__module__.partition(".")[0]
-    if package in ("open3d", "trimesh") and any(
-        hasattr(x, part) for part in ("points", "vertices", "point", "vertex")
-    ):
-        raise TypeError(
-            f"{name}: wanted an array, found {package}'s {type(x).__name__}; "
-            f"jaxreg.io.points_of({name}) is its points."
-        )
 
 
 def as_host_numbers(x: object, name: str) -> np.ndarray:

@@ -95,8 +95,8 @@ _ADVICE = {
         "the noise is too large for a proof. Average by `RiemannianStaircase()`."
     ),
     Status.DISCONNECTED: (
-        "The trusted edges do not reach every pose. See `placed`, and `component` "
-        "where there is one: other poses are meaningless or in a frame of their own. "
-        "Add edges or scans that bridge the parts."
+        "The trusted edges do not reach every pose. See `placed`, and `component` and "
+        "`scan_status` where there are any: other poses are meaningless or in a frame "
+        "of their own. Add edges or scans that bridge the parts."
     ),
 }

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import jaxreg
+from jaxreg._core.checks import as_host_array
 from jaxreg.app.plot.figure import draw_reconstruction
 from jaxreg.app.plot.graph import draw_graph
 from jaxreg.app.plot.report import write_report
@@ -130,7 +131,7 @@ def _clouds(solution: Solution, data: Sequence[Any]) -> list[np.ndarray]:
     if len(given) != num:
         wanted = "source and target" if pair else f"a list of {num} scans"
         raise ValueError(f"data: wanted {wanted}, found {len(given)} arrays.")
-    return [np.asarray(x) for x in given]
+    return [as_host_array(x, f"data[{i}]") for i, x in enumerate(given)]
 
 
 def _cross(solution: Solution) -> np.ndarray:

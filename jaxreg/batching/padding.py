@@ -8,7 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxreg._core.checks import as_float_array, check_mask, is_concrete
+from jaxreg._core.checks import (
+    as_float_array,
+    check_mask,
+    held_points,
+    is_concrete,
+)
 
 
 Tree = TypeVar("Tree")
@@ -33,7 +38,7 @@ def is_list_of_clouds(x: object) -> bool:
     if not isinstance(x, list | tuple) or not x:
         return False
     try:
-        return np.ndim(x[0]) == 2
+        return np.ndim(held_points(x[0])) == 2
     except ValueError:  # not rectangular
         return False
 

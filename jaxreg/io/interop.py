@@ -1,13 +1,13 @@
 """To and from the objects of Open3D, trimesh and GTSAM.
 
-Points of theirs need no copy by hand, either: `points_of` takes what holds points.
+Clouds and meshes of Open3D and trimesh are taken wherever points are.
 """
 
 from typing import Any
 
 import numpy as np
 
-from jaxreg._core.checks import as_host_numbers
+from jaxreg._core.checks import as_host_numbers, held_points
 from jaxreg.graph.pose_graph import PoseGraph, check_graph
 from jaxreg.io.extras import require
 
@@ -28,12 +28,9 @@ def points_of(geometry: Any) -> np.ndarray:
     Raises:
         TypeError: if the object holds no points.
     """
-    for part in ("point", "vertex"):  # Open3D's tensor kind
-        if hasattr(geometry, part):
-            return getattr(geometry, part).positions.cpu().numpy()
-    for part in ("points", "vertices"):
-        if hasattr(geometry, part):
-            return np.asarray(getattr(geometry, part))
+    points = held_points(geometry)
+    if points is not geometry:
+        return points
     raise TypeError(
         "geometry: wanted a cloud or mesh of Open3D or trimesh, found "
         f"{type(geometry).__name__}."

@@ -87,7 +87,7 @@ class ReconstructionSolution(eqx.Module):
         return eqx.tree_at(pairs_of, self, parts)
 
     def __repr__(self) -> str:
-        """One line: status, scans placed, other components, pairs trusted."""
+        """One line: status, scans placed, what the others have, pairs trusted."""
         if not is_concrete(self.status):
             return f"ReconstructionSolution(T_world_i {self.T_world_i.shape})"
         if self.status.ndim:
@@ -95,9 +95,11 @@ class ReconstructionSolution(eqx.Module):
             return f"ReconstructionSolution({batch})"
         others = np.bincount(np.asarray(self.component) + 1)[2:]
         more = f", apart from them {' and '.join(map(str, others))}"
+        left = np.asarray(self.scan_status)[~np.asarray(self.placed)]
+        left = f" ({counted(left)})" if len(left) else ""
         return (
             f"ReconstructionSolution({Status(int(self.status)).name}, "
-            f"{int(jnp.sum(self.placed))} of {self.placed.size} scans placed"
+            f"{int(jnp.sum(self.placed))} of {self.placed.size} scans placed{left}"
             f"{more if len(others) else ''}, "
             f"{int(jnp.sum(self.edge_weight > 0.5))} of {self.overlap.size} pairs "
             "trusted)"

@@ -49,9 +49,10 @@ def near_origin(points: object, mask: object, name: str) -> Moved:
             near_origin(x, m, f"{name}[{i}]")
             for i, (x, m) in enumerate(zip(points, masks, strict=False))
         ]
-        if len(each) < len(points) or all(x.origin is None for x in each):
+        far = [x.origin for x in each if x.origin is not None]
+        if len(each) < len(points) or not far:
             return Moved(points, None)
-        zero = np.zeros(np.shape(points[0])[-1])
+        zero = np.zeros_like(far[0])
         origins = [zero if x.origin is None else x.origin for x in each]
         return Moved([x.points for x in each], np.stack(origins))
     found = as_host_array(points, name)

@@ -105,7 +105,7 @@ def register(
     Args:
         source: `(n, d)` points, d = 2 or 3; a batch of pairs `(..., n, d)`; or a list
             of `(n_i, d)` points of any sizes, also none. Arrays are what
-            `numpy.asarray` or DLPack takes.
+            `numpy.asarray` or DLPack takes, or a cloud or mesh of Open3D or trimesh.
         target: `(m, d)` points, a batch with the same leading axes, or a list of the
             same length.
         method: `ParticleFilter()` by default, which needs no initial guess; `ICP()`

@@ -173,6 +173,7 @@ def samples() -> list[Sample]:
         "a.asc": _rows(spaced, start="# made here\n"),
         "b.txt": _rows("{1:.9g} {2:.9g}", CLOUD[:, :2]),
         "a.obj": _rows("v " + spaced),
+        "a.bin": np.pad(CLOUD, [(0, 0), (0, 1)]).astype("<f4").tobytes(),
     }
     mesh = _rows("v " + spaced) + b"".join(b"f -1 -2 %d\n" % k for k in range(1, 25))
     counted = {

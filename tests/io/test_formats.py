@@ -117,6 +117,22 @@ def test_pcd_of_the_specification(tmp_path: Path):
         np.testing.assert_array_equal(read_points(file), expected)
 
 
+def test_lidar_frames_of_kitti(tmp_path: Path):
+    rows = np.random.default_rng(0).normal(size=(50, 4)).astype("<f4")
+    path = tmp_path / "000000.bin"
+    rows.tofile(path)
+    found = read_points(path)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, rows[:, :3])
+    assert read_named(path)["000000"].fields == ("x", "y", "z", "intensity")
+    names, _ = read_scans(tmp_path)
+    assert names == ["000000"]
+    for other in (rows.tobytes() + b"1234", rows.view("<u4").astype("<f4").tobytes()):
+        path.write_bytes(other)
+        with pytest.raises(InputError, match="those of KITTI are read"):
+            read_points(path)
+
+
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_las_keeps_the_digits_of_map_coordinates(tmp_path: Path, suffix: str):
     path = tmp_path / f"a.{suffix}"

@@ -1,11 +1,14 @@
 """Objects of other libraries; those that are not installed are skipped."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
-from helpers import motion
+from helpers import blob, motion, move
 
 import jaxreg
+import jaxreg.app.views
 from jaxreg import io
 
 
@@ -28,6 +31,35 @@ def test_open3d_clouds_there_and_back():
     np.testing.assert_array_equal(io.points_of(cloud), POINTS)
     tensor = open3d.t.geometry.PointCloud(POINTS.astype(np.float32))
     np.testing.assert_array_equal(io.points_of(tensor), POINTS.astype(np.float32))
+
+
+@pytest.mark.parametrize("library", ["trimesh", "open3d"])
+def test_clouds_are_taken_wherever_points_are(library: str, tmp_path: Path):
+    pytest.importorskip(library)
+    make = io.to_open3d if library == "open3d" else io.to_trimesh
+    target = blob(200, 3)
+    T = motion(1, 3, angle=0.1, shift=0.02)
+    source = move(np.linalg.inv(T), target)
+    clouds = make(source), make(target)
+    sol = jaxreg.register(*clouds, jaxreg.ICP())
+    np.testing.assert_allclose(sol.T_target_source, T, atol=1e-4)
+    (one,) = jaxreg.register([clouds[0]], [clouds[1]], jaxreg.ICP())
+    np.testing.assert_allclose(one.T_target_source, T, atol=1e-4)
+    # Far away, too: in float64, as theirs are.
+    far = np.float64(source) + 1e4
+    (one,) = jaxreg.register([make(far)], [clouds[1]], jaxreg.ICP(), init=[_back(1e4)])
+    np.testing.assert_allclose(move(one.T_target_source, far), target, atol=1e-3)
+    io.write_points(tmp_path / "a.ply", clouds[0])
+    np.testing.assert_allclose(io.read_points(tmp_path / "a.ply"), source, atol=1e-6)
+    assert jaxreg.app.views.draw(sol, *clouds) is not None
+    with pytest.raises(ValueError, match=r"target\[0\]: wanted shape"):
+        jaxreg.register([target], [np.zeros((4, 4))], jaxreg.ICP())
+
+
+def _back(offset: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = -offset
+    return T
 
 
 def _graph() -> tuple[jaxreg.PoseGraph, np.ndarray]:

@@ -286,6 +286,15 @@ def test_arrays_keep_their_width_where_it_suffices(tmp_path: Path):
     np.testing.assert_allclose(found["three"], CLOUD[:9, :2] + [4, 0])
 
 
+def test_lidar_frames_keep_their_intensity(tmp_path: Path):
+    rows = np.concatenate([CLOUD, CLOUD[:, :1]], axis=1).astype("<f4")
+    rows.tofile(tmp_path / "a.bin")
+    write_moved(tmp_path / "b.bin", tmp_path / "a.bin", T)
+    found = np.fromfile(tmp_path / "b.bin", "<f4").reshape(-1, 4)
+    np.testing.assert_allclose(found[:, :3], moved(CLOUD), atol=1e-5)
+    np.testing.assert_array_equal(found[:, 3], rows[:, 3])
+
+
 def test_what_cannot_be_moved_leaves_no_file(tmp_path: Path):
     np.save(tmp_path / "a.npy", CLOUD)
     (tmp_path / "cut.ply").write_bytes(b"ply\n")

@@ -7,6 +7,7 @@ SIGTERM, 129 by SIGHUP, 141 when nobody reads the output any more.
 
 import _thread
 import contextlib
+import difflib
 import io
 import os
 import shlex
@@ -16,7 +17,7 @@ import threading
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import find_spec
-from typing import NoReturn
+from typing import NoReturn, get_args
 
 from jaxreg.app.folder import held
 from jaxreg.app.versions import version
@@ -129,6 +130,9 @@ def _run(arguments: list[str]) -> int:
 
     from jaxreg.app.cli.options import COMMANDS, Options
 
+    _require_command(
+        arguments[0], [get_args(x)[0].__name__.lower() for x in get_args(COMMANDS)]
+    )
     command = tyro.cli(
         COMMANDS,
         prog="jaxreg",
@@ -154,3 +158,14 @@ def _run(arguments: list[str]) -> int:
             text = (command.out / "result.json").read_text(encoding="utf-8")
             sys.stdout.write(text)
     return code
+
+
+def _require_command(word: str, commands: list[str]) -> None:
+    """Refuses a first word that is none, and names the one that is meant."""
+    if word.startswith("-") or word in commands:
+        return
+    near = difflib.get_close_matches(word, commands, n=1)
+    meant = f" Did you mean {near[0]}?" if near else ""
+    raise InputError(
+        f"{word}: no such command.{meant}\nCommands: {', '.join(commands)}."
+    )

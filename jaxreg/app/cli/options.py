@@ -159,7 +159,7 @@ class Multiview(ModelOptions):
         tyro.conf.Positional[tuple[Path, ...]],
         tyro.conf.arg(metavar="SCAN ...", help_behavior_hint="(required)"),
     ]
-    """Files (PLY, XYZ, PCD, LAS, ...), a folder of these, or an archive (NPZ, E57)."""
+    """Files (PLY, XYZ, PCD, LAS, BIN, ...), a folder, or an archive (NPZ, E57)."""
     truth: Annotated[
         Path | None,
         tyro.conf.arg(metavar="FILE.conf", help_behavior_hint="(default: none)"),

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import jaxreg
+from jaxreg._core.checks import as_host_array
 from jaxreg._core.status import Status
 from jaxreg.app.colors import scan_colors
 from jaxreg.app.plot.figure import principal_axes, tilt
@@ -69,7 +70,7 @@ def write_report(
         MissingExtraError: if plotly is not installed.
         ValueError: if scans and poses do not have the same number.
     """
-    clouds = [np.asarray(s) for s in scans]
+    clouds = [as_host_array(x, f"scans[{i}]") for i, x in enumerate(scans)]
     if isinstance(solution, jaxreg.RegistrationSolution):
         modes = _modes_of(solution) if modes is None else modes
         if covariances is None:

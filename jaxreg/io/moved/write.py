@@ -14,6 +14,7 @@ from jaxreg.io.atomic import atomic_write
 from jaxreg.io.files import is_packed, open_bytes, reading
 from jaxreg.io.moved.arrays import move_npy, move_npz
 from jaxreg.io.moved.e57 import move_e57
+from jaxreg.io.moved.kitti import move_bin
 from jaxreg.io.moved.las import move_las
 from jaxreg.io.moved.meshes import move_obj, move_stl
 from jaxreg.io.moved.motion import Moving
@@ -26,6 +27,7 @@ from jaxreg.io.points.read import ARCHIVES, TEXT, require_known, suffix_of
 _MOVERS = {
     ".ply": move_ply,
     ".pcd": move_pcd,
+    ".bin": move_bin,
     ".las": move_las,
     ".laz": move_las,
     ".obj": move_obj,
@@ -57,8 +59,8 @@ def write_moved(
         <BLANKLINE>
 
     Coordinates in float32 that go far away, as into a map's, become float64; those of
-    LAS get new offsets. Text has as many decimals as before, at least three. Of E57 the
-    poses change, not the points.
+    LAS get new offsets, and KITTI's `.bin` has float32 alone. Text has as many decimals
+    as before, at least three. Of E57 the poses change, not the points.
 
     Args:
         path: the new file, with the suffix of the old one; it appears whole or not.

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxreg.io.errors import InputError
 from jaxreg.io.files import is_packed, open_bytes, reading, require_regular, text_lines
-from jaxreg.io.points import arrays, e57, las, meshes, pcd, ply, text
+from jaxreg.io.points import arrays, e57, kitti, las, meshes, pcd, ply, text
 from jaxreg.io.points.content import require_suffix
 from jaxreg.io.points.other_text import OF_POSES, refusal
 from jaxreg.io.points.thinning import Step, at_most, every_row, text_step
@@ -23,6 +23,7 @@ _PARSERS = {
     ".npy": arrays.parse_npy,
     ".ply": ply.parse_ply,
     ".pcd": pcd.parse_pcd,
+    ".bin": kitti.parse_bin,
     ".las": las.parse_las,
     ".laz": las.parse_las,
     ".obj": meshes.parse_obj,
@@ -33,7 +34,8 @@ ARCHIVES = tuple(_ARCHIVE_READERS)
 SUFFIXES = (*_PARSERS, *ARCHIVES, *TEXT)
 _NEVER_PACKED = (".npy", *ARCHIVES, "")
 _FORMATS = (
-    "PLY, XYZ/CSV/TXT text, PCD, LAS/LAZ, OBJ, STL (each also .gz), E57, NPY, NPZ"
+    "PLY, XYZ/CSV/TXT text, PCD, LAS/LAZ, OBJ, STL, KITTI's .bin (each also .gz), "
+    "E57, NPY, NPZ"
 )
 
 
@@ -63,11 +65,12 @@ def read_points(path: str | Path) -> np.ndarray:
                [0., 1., 0.],
                [0., 0., 1.]], dtype=float32)
 
-    PLY (binary or ASCII), PCD, LAS, LAZ, the vertices of OBJ and STL, and text files;
-    all of these may be compressed (`.gz`). Text is separated by commas, semicolons or
-    white space; the columns that a header line names x, y, z are taken, without one the
-    first three of numbers, or both if there are two. NPY, NPZ and E57; one scan of an
-    NPZ or E57 file that holds several is named as `FILE.npz:KEY`.
+    PLY (binary or ASCII), PCD, LAS, LAZ, KITTI's `.bin` (float32 x y z intensity), the
+    vertices of OBJ and STL, and text files; all of these may be compressed (`.gz`).
+    Text is separated by commas, semicolons or white space; the columns that a header
+    line names x, y, z are taken, without one the first three of numbers, or both if
+    there are two. NPY, NPZ and E57; one scan of an NPZ or E57 file that holds several
+    is named as `FILE.npz:KEY`.
 
     Args:
         path: the file.

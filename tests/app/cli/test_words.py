@@ -58,6 +58,16 @@ def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str])
     assert "multiview" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("word", "said"), [("regster", "Did you mean register?"), ("xy", "Commands: demo")]
+)
+def test_a_command_that_is_none(
+    capsys: pytest.CaptureFixture[str], word: str, said: str
+):
+    assert main([word, "a.ply", "b.ply"]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_version(capsys: pytest.CaptureFixture[str]):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("jaxreg ")
