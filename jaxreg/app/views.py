@@ -100,10 +100,15 @@ def show(solution: Solution, *data: Any, names: Sequence[str] | None = None) -> 
     """
     path = Path(tempfile.mkdtemp(prefix="jaxreg-")) / "report.html"
     write_page(path, solution, *data, names=names)
+    open_where_seen(path.as_uri())
+    return path
+
+
+def open_where_seen(address: str) -> None:
+    """Opens a page in the browser, where there is a screen."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY")
     if sys.platform != "linux" or any(os.environ.get(name) for name in screens):
-        webbrowser.open(path.as_uri())
-    return path
+        webbrowser.open(address)
 
 
 def _require_one(solution: Solution) -> None:

@@ -46,9 +46,11 @@ def test_clouds_are_taken_wherever_points_are(library: str, tmp_path: Path):
     (one,) = jaxreg.register([clouds[0]], [clouds[1]], jaxreg.ICP())
     np.testing.assert_allclose(one.T_target_source, T, atol=1e-4)
     # Far away, too: in float64, as theirs are.
-    far = np.float64(source) + 1e4
+    far = source.astype(np.float64) + 1e4
     (one,) = jaxreg.register([make(far)], [clouds[1]], jaxreg.ICP(), init=[_back(1e4)])
-    np.testing.assert_allclose(move(one.T_target_source, far), target, atol=1e-3)
+    np.testing.assert_allclose(
+        move(np.asarray(one.T_target_source), far), target, atol=1e-3
+    )
     io.write_points(tmp_path / "a.ply", clouds[0])
     np.testing.assert_allclose(io.read_points(tmp_path / "a.ply"), source, atol=1e-6)
     assert jaxreg.app.views.draw(sol, *clouds) is not None

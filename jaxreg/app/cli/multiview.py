@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,12 @@ from jaxreg.app.cli.known import (
 )
 from jaxreg.app.cli.options import Multiview, Order
 from jaxreg.app.cli.runtime import Session, key_of, method_of
+from jaxreg.app.live import LiveView
 from jaxreg.app.pair_log import PairLog, Pairs
 from jaxreg.app.plot.results import result_of
 from jaxreg.app.result import Result
 from jaxreg.app.versions import version
+from jaxreg.app.views import open_where_seen
 from jaxreg.io.errors import InputError
 from jaxreg.io.graphs.g2o_known import KnownOfGraph
 from jaxreg.io.poses.stanford import read_conf
@@ -46,19 +49,23 @@ def run(command: Multiview, session: Session) -> int:
         session.console.print(note)
     key, method = key_of(command), method_of(command)
     log = _log(command, session, scans)
+    view = _view(session, scans, method, log) if command.view else None
     try:
         with session.progress() as progress, session.timed("run", computes=True):
             result = reconstruct_scans(
                 scans,
                 key,
                 method,
-                progress,
+                progress if view is None else _both(progress, view.progress),
                 command.order,
                 log,
                 command.viewpoint,
                 located,
                 known,
+                None if view is None else view.pairs,
             )
+        if view is not None:
+            view.poses(result.T_world_i, result.component, result.edges, result.weight)
     except KeyboardInterrupt as err:
         if not len(log):
             raise
@@ -66,10 +73,34 @@ def run(command: Multiview, session: Session) -> int:
             f"pairs kept in {log.path}: {len(log)}; "
             "the same command with --resume goes on from there"
         ) from err
+    finally:
+        if view is not None:
+            view.close()
     errors = None if truth is None else outputs.pose_errors(result, *truth)
     code = report(session, result, scans, errors)
     log.remove()
     return code
+
+
+def _view(
+    session: Session, scans: Scans, method: jaxreg.ParticleFilter, log: PairLog
+) -> LiveView:
+    """The page, opened where there is a screen, with the pairs that are known."""
+    least = float(np.asarray(method.min_log_evidence))
+    view = LiveView(scans.names, *scans.centred(), least)
+    session.console.print(f"To watch while it runs: {view.url}")
+    open_where_seen(view.url)
+    if log.pairs is not None:
+        view.pairs(log.pairs)
+    return view
+
+
+def _both(one: Progress, other: Progress) -> Progress:
+    def tell(stage: str, done: int, total: int) -> None:
+        one(stage, done, total)
+        other(stage, done, total)
+
+    return tell
 
 
 def _located(command: Multiview, scans: Scans) -> jaxreg.ScanPositions | None:
@@ -129,16 +160,25 @@ def reconstruct_scans(
     viewpoint: tuple[float, ...] | None = None,
     positions: jaxreg.ScanPositions | None = None,
     known: KnownOfGraph | None = None,
+    heard: Callable[[Pairs], None] | None = None,
 ) -> Result:
     """Reconstructs centred scans and moves the answer to the frames of the files.
 
-    Pairs that `log` holds are not registered again, and those found are added to it.
+    Pairs that `log` holds are not registered again, and those found are added to it;
+    `heard` is told of them, too.
     """
     centred, middles = scans.centred()
     eyes = None if viewpoint is None else (viewpoint - middles).astype(centred[0].dtype)
     known = KnownOfGraph([], [], []) if known is None else known
     told = of_middles(known, middles)
     kept = None if log is None or log.pairs is None else log.pairs
+
+    def keep(motions: jaxreg.RelativeMotions) -> None:
+        found = _pairs(motions)
+        for tell in (heard, None if log is None else log.add):
+            if tell is not None:
+                tell(found)
+
     sol = jaxreg.reconstruct(
         centred,
         key=key,
@@ -150,7 +190,7 @@ def reconstruct_scans(
         control=told.control,
         previous=None if kept is None else jaxreg.RelativeMotions.kept(*kept),
         progress=progress,
-        on_pairs=None if log is None else lambda m: log.add(_pairs(m)),
+        on_pairs=keep,
     )
     result = result_of(sol, scans.points, scans.names)
     # The frame of a component's first scan; that of a scan alone means nothing.

@@ -189,6 +189,8 @@ class Multiview(ModelOptions):
     """Poses that stay: a file of one matrix, or its numbers in quotes."""
     resume: bool = False
     """Go on with the pairs that an interrupted run left in the output folder."""
+    view: bool = False
+    """Show scans, pairs and trust in the browser as they come; of the extra `view`."""
 
 
 @dataclass(frozen=True)

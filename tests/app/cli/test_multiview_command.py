@@ -1,15 +1,19 @@
 """What `jaxreg multiview` writes and tells, with a stand-in for the solver."""
 
+import functools
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxreg.app.cli import multiview
 from jaxreg.app.cli.main import main
+from jaxreg.app.live import LiveView
 from jaxreg.io import read_points, read_tum
 from tests.app.cli.stand_ins import (
     CLOUD,
@@ -64,6 +68,32 @@ def test_multiview_far_from_the_origin_keeps_its_digits(
     np.testing.assert_allclose(merged[1], merged[0], rtol=0, atol=1e-5)
     _, poses = read_tum("jaxreg-out/poses.tum")
     assert poses.shape == (2, 4, 4)
+
+
+def test_a_view_is_told_of_the_run_and_closed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    pytest.importorskip("viser")
+    scans = save_scans(folder)
+    fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    opened: list[str] = []
+    told: list[str] = []
+    monkeypatch.setattr(multiview, "open_where_seen", opened.append)
+    for name in ("progress", "poses", "close"):
+        monkeypatch.setattr(LiveView, name, _heard(told, getattr(LiveView, name)))
+    assert main(["multiview", *scans, "--view", "--json"]) == 0
+    assert told == ["progress", "progress", "poses", "close"]
+    assert opened[0].startswith("http://localhost:")
+    assert json.loads(capsys.readouterr().out)["status"] == "CONVERGED"
+
+
+def _heard(told: list[str], method: Callable[..., None]) -> Callable[..., None]:
+    @functools.wraps(method)
+    def call(*args: object) -> None:
+        told.append(method.__name__)
+        method(*args)
+
+    return call
 
 
 def test_a_viewpoint_is_moved_with_each_scan(
