@@ -39,6 +39,7 @@ class Page:
         self._page = page = self._browser.new_page(
             viewport={"width": width, "height": height},
             is_mobile=width < 600,
+            has_touch=width < 600,
             color_scheme="dark" if dark else "light",
         )
         self.errors, self.requests = [], []

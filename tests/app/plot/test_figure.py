@@ -4,6 +4,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from jaxreg.app.colors import scan_colors
 from jaxreg.app.plot import draw_graph, draw_reconstruction, save_figure
 from jaxreg.app.plot.render import render_points
 
@@ -106,3 +107,17 @@ def test_renderer_lights_from_the_upper_left():
     size = image.shape[0]
     near, far = size // 3, 2 * size // 3
     assert image[near, near, 0] > image[far, far, 0] + 0.1
+
+
+def test_colours_of_some_scans_differ_for_the_colour_blind():
+    # Machado, Oliveira, Fernandes 2009: what a deuteranope sees, in linear RGB.
+    sees = np.array(
+        [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]]
+    )
+    linear = scan_colors(8) ** 2.2
+    for seen in (linear, linear @ sees.T):
+        color = np.clip(seen, 0, 1) ** (1 / 2.2)
+        apart = np.linalg.norm(color[:, None] - color, axis=2) + np.eye(8)
+        assert apart.min() > 0.2
+    assert len(np.unique(scan_colors(40), axis=0)) == 40
+    np.testing.assert_array_equal(scan_colors(40)[:3], scan_colors(3))

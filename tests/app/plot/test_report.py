@@ -282,6 +282,7 @@ def test_modes_on_a_dark_phone(page: Page, tmp_path: Path):
     drawn = "document.getElementById('curves').data.map(line => line.y.length)"
     assert page.run(drawn) == [2, 2, 2, 2]  # two energies, sample size, width
     assert page.run("document.documentElement.scrollWidth") <= 390
+    assert "pinch to zoom" in page.run("document.getElementById('hint').textContent")
     assert page.run("document.querySelectorAll('#modes button').length") == 2
     assert "σ" in page.run("document.getElementById('poses').textContent")
     x = "document.getElementById('scene').data[1].x[0]"

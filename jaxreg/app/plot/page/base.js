@@ -62,6 +62,14 @@ function number(x, digits = 4) {
   return String(Number(x.toPrecision(Math.max(digits, Math.ceil(Math.log10(size))))));
 }
 
+// In words of a finger where there is no mouse.
+function howToMove() {
+  const touch = matchMedia("(pointer: coarse)").matches;
+  const zoom = touch ? "pinch to zoom" : "wheel to zoom";
+  if (FLAT) return `Drag to move, ${zoom}.`;
+  return `Drag to turn, ${zoom}${touch ? "" : ", right button to move"}.`;
+}
+
 function degrees(x) { return x === null || x === undefined ? null : (x * 180) / Math.PI; }
 function rgb(c) { return `rgb(${c.map((x) => Math.round(x)).join(",")})`; }
 function mix(a, b, t) { return a.map((x, k) => x + (b[k] - x) * t); }

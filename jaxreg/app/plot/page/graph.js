@@ -73,8 +73,7 @@ function startGraph() {
   choice("when", [["before", "Before"], ["after", "After"]], "when");
   $("color").remove();
   $("home").addEventListener("click", () => Plotly.newPlot("scene", graphTraces(), graphLayout(), CONFIG));
-  $("hint").textContent = FLAT ? "Drag to move, wheel to zoom."
-    : "Drag to turn, wheel to zoom, right button to move.";
+  $("hint").textContent = howToMove();
   $("list-title").textContent = "Edges";
   for (const [kind, label, color] of KINDS) {
     const box = el("input", { type: "checkbox" });

@@ -128,9 +128,11 @@ function drawSlab() {
   });
 }
 
-// The axis across which a cut shows most, and where to begin.
+// The axis across which a cut shows most, of those that are not seen edge-on at first,
+// and where to begin.
 function chooseCut() {
-  const lengths = AXES.map((_, a) => outlineLength(a));
+  const faces = AXES.map((_, a) => Math.abs(DATA.camera[2][a]) > 0.3);
+  const lengths = AXES.map((_, a) => (faces[a] ? outlineLength(a) : -1));
   state.axis = lengths.indexOf(Math.max(...lengths));
   state.cut = middleCut(state.axis);
 }

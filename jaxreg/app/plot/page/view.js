@@ -331,10 +331,9 @@ function startScans() {
   choice("color", [["scan", "By scan"], ["distance", "By distance"]], "color");
   const total = POINTS.reduce((sum, p) => sum + p.n, 0);
   const all = DATA.scans.reduce((sum, s) => sum + s.points - s.dropped, 0);
-  const turn = FLAT ? "Drag to move, wheel to zoom." : "Drag to turn, wheel to zoom, right button to move.";
   const thinned = total < all ? ` ${total.toLocaleString("en")} of ${all.toLocaleString("en")} points are drawn.` : "";
   const mixed = FLAT ? "" : " Where colours mix, scans coincide.";
-  $("hint").textContent = turn + mixed + thinned;
+  $("hint").textContent = howToMove() + mixed + thinned;
   $("home").addEventListener("click", resetView);
   scanList();
   modeList();
