@@ -55,8 +55,9 @@ class Result:
         attempt: whether the poses are shown, but not believed.
         aligned: files of whole scans in the common frame.
         fixed: names of scans whose poses were held.
-        known: of each control point `kind`, `frame`, `weight`, `translation`; None
-            where the frame is that of the first scan.
+        known: of each control point or level `kind`, `frame`, `weight`, and how far it
+            is off, `translation` or `rotation`; None where the frame is that of the
+            first scan.
     """
 
     names: list[str]

@@ -31,6 +31,7 @@ def average(
     priors: Sequence[tuple[Any, ...]] | None = None,
     fixed: Sequence[tuple[Any, ...]] | None = None,
     control: Sequence[tuple[Any, ...]] | None = None,
+    levels: Sequence[tuple[Any, ...]] | None = None,
 ) -> AveragingSolution: ...
 
 
@@ -47,6 +48,7 @@ def average(
     priors: Sequence[tuple[Any, ...]] | None = None,
     fixed: Sequence[tuple[Any, ...]] | None = None,
     control: Sequence[tuple[Any, ...]] | None = None,
+    levels: Sequence[tuple[Any, ...]] | None = None,
 ) -> list[AveragingSolution]: ...
 
 
@@ -62,6 +64,7 @@ def average(
     priors: Sequence[tuple[Any, ...]] | None = None,
     fixed: Sequence[tuple[Any, ...]] | None = None,
     control: Sequence[tuple[Any, ...]] | None = None,
+    levels: Sequence[tuple[Any, ...]] | None = None,
 ) -> AveragingSolution | list[AveragingSolution]:
     """Finds poses that agree with relative motions: `T_i_j = inv(T_world_i) T_world_j`.
 
@@ -107,7 +110,12 @@ def average(
             `(i, p_i, p_world, information)`: frame i sees at `p_i` what lies at
             `p_world`, such as a target, or, with `p_i` the place of the antenna, a
             satellite fix. They are adjusted to as priors are. Without priors and fixed
-            poses three that are on no line are needed (two in 2D).
+            poses three that are on no line are needed (two in 2D, or beside levels).
+        levels: tilts that are known, of levelled scanners or inclinometers, a list of
+            `(i, up_i, deviation)`: the direction `up_i` of frame i points along the
+            last axis of the world, each of its two angles with that deviation, in
+            radians. 3D alone; they are adjusted to as priors are, and hold neither
+            place nor heading.
 
     Returns:
         An `AveragingSolution`, with leading axes for a batch; for a list a list of
@@ -115,12 +123,13 @@ def average(
         frame 0 by edges of positive weight, see `placed`.
         NON_FINITE: edges or poses with NaN or inf were met; such edges are ignored,
         such poses returned as the identity.
-        DEGENERATE: the control points that agree lie on a line; the poses are then in
-        no world. MAX_STEPS: the steps ran out. NO_AGREEMENT: there are more motions
-        than a tree needs, and nothing agrees beyond what any tree agrees with
-        (`log_evidence` is at most 0, and so is that of the spanning tree of greatest
-        weight); the poses of `Correntropy` are then those of its start. Or of priors
-        and control points, two and more without fixed poses, no more than half agree.
+        DEGENERATE: the control points that agree lie on a line, or beside levels on a
+        vertical one; the poses are then in no world. MAX_STEPS: the steps ran out.
+        NO_AGREEMENT: there are more motions than a tree needs, and nothing agrees
+        beyond what any tree agrees with (`log_evidence` is at most 0, and so is that of
+        the spanning tree of greatest weight); the poses of `Correntropy` are then those
+        of its start. Or of priors and control points, or of levels, two and more
+        without fixed poses, no more than half agree.
 
     Raises:
         TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,
@@ -128,15 +137,16 @@ def average(
         ValueError: if `init` has another shape than the poses or is no rigid motion
             within 1e-2, a batch has several leading axes, the graphs of a list differ
             in dimension or in whether they have information, or the mesh has no axis
-            "pair"; or if a row of `priors`, `fixed` or `control`, which is named, does
-            not fit the graph, has a singular information, or fixes a frame twice.
+            "pair"; or if a row of `priors`, `fixed`, `control` or `levels`, which is
+            named, does not fit the graph, has a singular information, or fixes a frame
+            twice.
 
     Positions in the world may be map coordinates: in NumPy arrays of float64 they are
     taken from the first before they are rounded to the dtype of the graph, and where
     the answer needs them `T_world_i` is a NumPy array of float64.
 
     Gradients: see the method. `T_world_i` always follows `init[0]`, or what is known;
-    with priors or points it is differentiated at the adjustment, trust held.
+    with priors, points or levels it is differentiated at the adjustment, trust held.
 
     Compilation: graphs of a list are padded to one of few numbers of poses, four an
     octave from 8 on, and to the edges of the largest that shares it; each such size
@@ -148,12 +158,14 @@ def average(
     check_count(batch_size, "batch_size")
     check_callable(progress, "progress")
     key = None if key is None else check_key(key)
-    told = priors is not None or fixed is not None or control is not None
+    told = any(x is not None for x in (priors, fixed, control, levels))
     many = isinstance(graph, list | tuple) or (
         isinstance(graph, PoseGraph) and graph.edges.ndim == 3
     )
     if told and many:
-        raise ValueError("priors, fixed, control: of one graph, found many graphs.")
+        raise ValueError(
+            "priors, fixed, control, levels: of one graph, found many graphs."
+        )
     if isinstance(graph, list | tuple):
         how = batch_size, progress, chosen_devices(mesh)
         return average_list(graph, method, init, key, *how)
@@ -162,7 +174,7 @@ def average(
         return average_batch(graph, method, init, key, batch_size, devices)
     one = check_graph(graph, "graph")
     start = check_init(init, one, "init")
-    known = check_known(priors, fixed, control, one) if told else None
+    known = check_known(priors, fixed, control, levels, one) if told else None
     if known is None:
         solution = average_graph(one, method, start, key)
     else:

@@ -49,7 +49,8 @@ class AveragingSolution(eqx.Module):
         length_scale: the length that stands for one radian; see `PoseGraph`.
         trace: how the method came to rest, or None if it takes no steps of its own.
         prior_weight: `(p,)` how much each prior is trusted, then each control point,
-            from 0 to 1; 0 for priors of frames that are fixed. None without any.
+            then each level, from 0 to 1; 0 for priors of frames that are fixed. None
+            without any.
     """
 
     T_world_i: Float[Array, "v D D"]

@@ -22,6 +22,7 @@ def pose_covariances(
     priors: Told = None,
     fixed: Told = None,
     control: Told = None,
+    levels: Told = None,
 ) -> Float[Array, "v k k"]:
     """The marginal covariance of each pose, with frame 0 known exactly.
 
@@ -39,6 +40,7 @@ def pose_covariances(
         priors: those that `average` was given; then frame 0 is held by nothing else.
         fixed: likewise.
         control: likewise.
+        levels: likewise.
 
     Returns:
         `(v, k, k)`; 0 for frame 0, or for fixed frames; NaN for frames that no trusted
@@ -51,7 +53,7 @@ def pose_covariances(
 
     Gradients: none (cut).
     """
-    whole, placed, first = as_adjusted(graph, solution, priors, fixed, control)
+    whole, placed, first = as_adjusted(graph, solution, priors, fixed, control, levels)
     check_count(max_unknowns, "max_unknowns")
     k = lie.tangent_dim(graph.dim)
     if graph.num_poses * k > max_unknowns:

@@ -24,8 +24,8 @@ class EdgeReport:
     """Residuals of an adjustment. NumPy arrays, float64.
 
     Attributes:
-        edges: `(e, 2)` frames i and j; of priors and control points, which follow the
-            edges of the graph, i is -1, the world.
+        edges: `(e, 2)` frames i and j; of priors, control points and levels, which
+            follow the edges of the graph, i is -1, the world.
         trusted: `(e,)` whether an edge is part of the adjustment.
         rotation: `(e,)` size of the residual, radians.
         translation: `(e,)` size of the residual, unit of the graph.
@@ -78,6 +78,7 @@ def edge_report(
     priors: Told = None,
     fixed: Told = None,
     control: Told = None,
+    levels: Told = None,
 ) -> EdgeReport:
     """Residuals, chi-square and redundancy numbers of averaged poses.
 
@@ -103,6 +104,7 @@ def edge_report(
         priors: those that `average` was given; they are rows after the edges.
         fixed: likewise; fixed frames are no unknowns.
         control: likewise; rows after the priors, of d components.
+        levels: likewise; rows after the control points, of two components.
 
     Raises:
         TypeError: for anything but a graph and a solution.
@@ -113,7 +115,9 @@ def edge_report(
     Reference: Baarda 1968; Foerstner 1987 (redundancy numbers).
     """
     prior_noise, own = graph.information is not None, np.asarray(graph.edges)
-    graph, solution, first = as_adjusted(graph, solution, priors, fixed, control)
+    graph, solution, first = as_adjusted(
+        graph, solution, priors, fixed, control, levels
+    )
     check_count(max_unknowns, "max_unknowns")
     with jax.enable_x64(True):
         wide, T = widened((graph, solution.T_world_i))
@@ -126,7 +130,8 @@ def edge_report(
         few = graph.num_poses * lie.tangent_dim(graph.dim) <= max_unknowns
         at = jax.tree.map(np.asarray, _linearised(wide, T, jnp.asarray(trusted), few))
     r, weights = np.where(sound[:, None], at.residual, np.nan), at.information
-    k, ranks = r.shape[1], _ranks(weights)
+    eps = float(jnp.finfo(graph.T_i_j.dtype).eps)
+    k, ranks = r.shape[1], _ranks(weights, graph.dim, eps)
     redundancy = np.full(len(r), np.nan)
     if at.normal is not None:
         redundancy = np.where(trusted, _redundancy(at, graph, ranks, held), 1.0)
@@ -154,10 +159,18 @@ def edge_report(
     )
 
 
-def _ranks(Omega: np.ndarray) -> np.ndarray:
-    """`(e,)` components of which an information says something."""
-    sizes = np.linalg.eigvalsh(np.where(np.isfinite(Omega), Omega, 0))
-    return np.sum(sizes > 1e-9 * sizes[:, -1:], axis=1)
+def _ranks(Omega: np.ndarray, d: int, eps: float) -> np.ndarray:
+    """`(e,)` components of which an information says something, beyond rounding.
+
+    Lengths and angles in units in which they weigh alike.
+    """
+    W = np.where(np.isfinite(Omega), Omega, 0)
+    each = np.einsum("eaa->ea", W)
+    shift, turn = (each[:, part].mean(1) for part in (slice(d), slice(d, None)))
+    unit = np.repeat(np.stack([shift, turn], 1), [d, W.shape[1] - d], axis=1)
+    unit = np.sqrt(np.where(unit > 0, unit, 1))
+    sizes = np.linalg.eigvalsh(W / unit[:, :, None] / unit[:, None])
+    return np.sum(sizes > 10 * eps * sizes[:, -1:], axis=1)
 
 
 class _Linearised(NamedTuple):

@@ -16,7 +16,7 @@ from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.registration.far import near_origin, pose_back, pose_moved
 
 
-_Known = tuple[Told, Told, Told]
+_Known = tuple[Told, Told, Told, Told]
 OnPairs = Callable[[RelativeMotions], None]
 
 
@@ -83,10 +83,10 @@ class FarScans:
             return previous
         return self._solution(previous, pose_moved)
 
-    def known(self, priors: Told, fixed: Told, control: Told) -> _Known:
+    def known(self, priors: Told, fixed: Told, control: Told, levels: Told) -> _Known:
         """What is known, checked before, of the moved frames."""
         if not self.moved:
-            return priors, fixed, control
+            return priors, fixed, control, levels
         for n, row in enumerate(priors or ()):
             if self.origin[row[0]].any() and len(row) > 2 and row[2] is not None:
                 raise ValueError(
@@ -102,7 +102,7 @@ class FarScans:
             (row[0], np.asarray(row[1], np.float64) - self.origin[row[0]], *row[2:])
             for row in control or ()
         ]
-        return poses, held, points
+        return poses, held, points, levels
 
     def _pose_moved(self, frame: int, T: object) -> np.ndarray:
         T = as_host_numbers(T, "T")

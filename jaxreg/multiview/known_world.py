@@ -1,8 +1,8 @@
-"""Scans in a world that is known: fixed poses, priors of poses, surveyed points.
+"""Scans in a world that is known: poses, fixed or nearly, surveyed points, levels.
 
 The motions between scans that were measured last are averaged once more, together with
-what is known (`average` with `priors`, `fixed` and `control`). They weigh by the noise
-that they show.
+what is known (`average` with `priors`, `fixed`, `control` and `levels`). They weigh by
+the noise that they show.
 """
 
 import dataclasses
@@ -43,14 +43,19 @@ class KnownWorld(eqx.Module):
 
     @classmethod
     def of(
-        cls, priors: Told, fixed: Told, control: Told, scans: Float[Array, "v n d"]
+        cls,
+        priors: Told,
+        fixed: Told,
+        control: Told,
+        levels: Told,
+        scans: Float[Array, "v n d"],
     ) -> "KnownWorld | None":
         """From the arguments of `reconstruct`; None if they are."""
         eye = jnp.eye(scans.shape[-1] + 1, dtype=scans.dtype)[None]
         one = jnp.ones(1, scans.dtype)
         frames = jnp.zeros((1, 2), jnp.int32)
         blank = PoseGraph(frames, eye, one, one > 0, None, len(scans))
-        known = check_known(priors, fixed, control, blank)
+        known = check_known(priors, fixed, control, levels, blank)
         return None if known is None else cls(known)
 
     @property
@@ -66,7 +71,7 @@ class KnownWorld(eqx.Module):
         averaging: AbstractAverager | None,
         least: Scalar,
     ) -> tuple[Placement, Float[Array, " k"]]:
-        """Poses in the world, and the trust in each prior, then in each point.
+        """Poses in the world, and the trust in each prior, then point, then level.
 
         Args:
             scans: prepared scans.

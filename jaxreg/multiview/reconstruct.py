@@ -57,6 +57,7 @@ def reconstruct(
     priors: Told = None,
     fixed: Told = None,
     control: Told = None,
+    levels: Told = None,
     progress: Progress | None = None,
     on_pairs: OnPairs | None = None,
 ) -> ReconstructionSolution:
@@ -97,8 +98,10 @@ def reconstruct(
         control: surveyed points, a list of `(i, p_i, p_world)` or
             `(i, p_i, p_world, information)`: scan i sees at `p_i` what lies at
             `p_world`, such as a target or, with `p_i` the place of the antenna, a
-            satellite fix. See `average`, which takes the same three; parts that no
-            overlap joins meet in the world.
+            satellite fix. Parts that no overlap joins meet in the world.
+        levels: tilts, a list of `(i, up_i, deviation)`: what points up in scan i, with
+            the deviation of its angles in radians. See `average`, which takes the same
+            four.
         progress: called as `progress(stage, done, total)`; not under `jit`.
         on_pairs: called with the `RelativeMotions` of every few pairs as they are
             found, in the input's frames and unit, as NumPy arrays with motions in
@@ -115,10 +118,10 @@ def reconstruct(
         DISCONNECTED where some scans could not be placed, AMBIGUOUS where some can slip
         along the others; `scan_status` says which, and what is wrong with them.
         NO_AGREEMENT where no pairs agree with each other: scans then lie as the pairs
-        of largest overlap have them; or of priors and control points, without fixed
-        scans, no more than half agree; and of a scan that is fixed where none of its
-        pairs has it. DEGENERATE where what is known holds no part of the scans, as of
-        points on a line.
+        of largest overlap have them; or of priors and control points, or of levels,
+        without fixed scans, no more than half agree; and of a scan that is fixed where
+        none of its pairs has it. DEGENERATE where what is known holds no part of the
+        scans, as of points on a line.
 
     Gradients:
         Of `T_world_i`, by the points of all scans: implicit where the last steps of
@@ -142,14 +145,15 @@ def reconstruct(
     method = ParticleFilter() if method is None else method
     check_method(method, AbstractRegistrar)
     check_instance(averaging, "averaging", AbstractAverager | None)
-    known = KnownWorld.of(priors, fixed, control, points)
+    known = KnownWorld.of(priors, fixed, control, levels, points)
     if hold_previous:
         _check_can_hold(previous, known)
     if positions is not None:
         positions.check_fits(points, method)
     inputs = points, row_mask, eyes, cast_floats(positions, points.dtype)
     if far.moved:
-        known = KnownWorld.of(*far.known(priors, fixed, control), points)
+        moved = far.known(priors, fixed, control, levels)
+        known = KnownWorld.of(*moved, points)
     key, order = check_key(key), _checked(order)
     if not (is_concrete(points) and is_concrete(key)):
         if order != "any" or not (previous is None and on_pairs is None):

@@ -51,7 +51,8 @@ class ReconstructionSolution(eqx.Module):
         trace: how the averaging that chose the pairs came to rest, lengths in the unit
             of the input; None if its method takes no steps.
         prior_weight: `(p,)` how far each prior is trusted, then each control point,
-            from 0 to 1; 0 for priors of scans that are fixed. None without any.
+            then each level, from 0 to 1; 0 for priors of scans that are fixed. None
+            without any.
     """
 
     T_world_i: Float[Array, "v D D"]

@@ -86,6 +86,23 @@ def test_wrong_priors_and_points_are_told(found):
     assert errors[:, 1].max() < 0.003
 
 
+def test_levelled_scans_and_two_targets_hold_the_world(found):
+    scans, truth, _, _ = found
+    levels = [(k, truth[k][2, :3], 1e-3) for k in range(8)]
+    levels[5] = (5, truth[5][2, :3] + [0.3, 0, 0.2], 1e-3)
+    control = []
+    for k in (1, 6):
+        seen = np.asarray(scans[k][k], np.float64)
+        control.append((k, seen, move(truth[k], seen[None])[0], np.eye(3) * 1e6))
+    sol = _solve(found, control=control, levels=levels)
+    assert int(sol.status) == Status.CONVERGED
+    right = np.asarray(sol.prior_weight) > 0.5
+    np.testing.assert_array_equal(np.flatnonzero(~right), [2 + 5])
+    errors = _errors(sol.T_world_i, truth)
+    assert errors[:, 0].max() < 0.02
+    assert errors[:, 1].max() < 0.006
+
+
 @pytest.fixture(scope="module")
 def halves(found):
     """The same, but no pair joins scans 0 to 4 with 5 to 7."""

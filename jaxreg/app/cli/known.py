@@ -1,6 +1,7 @@
-"""What is known of poses: lines of a graph's file, `--control` and `--fix`."""
+"""What is known of poses: lines of a graph's file, `--control`, `--level`, `--fix`."""
 
 import csv
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from jaxreg.app.cli.guess import read_guess
-from jaxreg.app.cli.options import Average, Multiview
+from jaxreg.app.cli.options import Average, KnownOptions, Multiview
 from jaxreg.app.cli.runtime import Session
 from jaxreg.averaging import AveragingSolution, EdgeReport
 from jaxreg.io.errors import InputError
@@ -18,9 +19,13 @@ from jaxreg.io.graphs.g2o_known import KnownOfGraph
 from jaxreg.io.printable import printable
 
 
+#: Of no graph and no scan.
+NOTHING = KnownOfGraph([], [], [])
+
+
 def read_known(command: Average, ids: np.ndarray, d: int) -> KnownOfGraph:
     """All that is known; a pose of `--fix` takes the place of the file's."""
-    known = KnownOfGraph([], [], [])
+    known = NOTHING
     if command.graph.suffix.lower() != ".log":
         known = read_g2o_known(command.graph)
     return _with_options(known, command, ids, d)
@@ -28,11 +33,11 @@ def read_known(command: Average, ids: np.ndarray, d: int) -> KnownOfGraph:
 
 def read_known_scans(command: Multiview, names: list[str], d: int) -> KnownOfGraph:
     """What the options tell of scans."""
-    return _with_options(KnownOfGraph([], [], []), command, np.array(names), d)
+    return _with_options(NOTHING, command, np.array(names), d)
 
 
 def _with_options(
-    known: KnownOfGraph, command: Average | Multiview, ids: np.ndarray, d: int
+    known: KnownOfGraph, command: KnownOptions, ids: np.ndarray, d: int
 ) -> KnownOfGraph:
     fixed = dict(known.fixed)
     for words in command.fix:
@@ -44,13 +49,16 @@ def _with_options(
     control = known.control
     if command.control is not None:
         control = control + _read_control(command.control, ids, d)
-    told = KnownOfGraph(known.priors, list(fixed.items()), control)
-    if control and not (known.priors or fixed) and len(control) < d:
+    levels = [] if command.level is None else _read_levels(command.level, ids, d)
+    least = 2 if levels else d
+    held = known.priors or fixed
+    if (control or levels) and not held and len(control) < least:
+        beside = " beside --level" if levels else ""
         raise InputError(
-            f"--control: wanted at least {d} points, or a fixed pose, found "
-            f"{len(control)}."
+            f"--control: wanted at least {least} points{beside}, or a fixed pose, "
+            f"found {len(control)}."
         )
-    return told
+    return KnownOfGraph(known.priors, list(fixed.items()), control, levels)
 
 
 def of_middles(known: KnownOfGraph, middles: np.ndarray) -> KnownOfGraph:
@@ -61,26 +69,31 @@ def of_middles(known: KnownOfGraph, middles: np.ndarray) -> KnownOfGraph:
         moved[:-1, -1] += moved[:-1, :-1] @ middles[frame]
         fixed.append((frame, moved))
     control = [(frame, p - middles[frame], *rest) for frame, p, *rest in known.control]
-    return KnownOfGraph([], fixed, control)
+    return KnownOfGraph([], fixed, control, known.levels)
 
 
 def known_of_scans(
     known: KnownOfGraph, T_world_i: np.ndarray, trust: Any, names: list[str]
 ) -> list[dict[str, Any]]:
-    """How far each control point is off, and its trust, for result.json."""
+    """How far control points and levels are off, and their trust, for result.json."""
     entries = []
-    for weight, (frame, p, q, *_) in zip(np.asarray(trust), known.control, strict=True):
-        T = T_world_i[frame]
-        off = T[:-1, :-1] @ p + T[:-1, -1] - q
-        entries.append(
-            {
-                "kind": "control",
-                "frame": names[frame],
-                "weight": float(weight),
-                "translation": float(np.linalg.norm(off)),
-            }
-        )
+    rows = [("control", *row) for row in known.control]
+    rows += [("level", *row) for row in known.levels]
+    for weight, (kind, frame, x, y, *_) in zip(np.asarray(trust), rows, strict=True):
+        R, t = T_world_i[frame][:-1, :-1], T_world_i[frame][:-1, -1]
+        if kind == "control":
+            off = {"translation": float(np.linalg.norm(R @ x + t - y))}
+        else:
+            off = {"rotation": tilt(R, x)}
+        name = names[frame]
+        entries.append({"kind": kind, "frame": name, "weight": float(weight)} | off)
     return entries
+
+
+def tilt(R: np.ndarray, up: np.ndarray) -> float:
+    """The angle between what is up in a frame and the vertical, in radians."""
+    x, y, z = R @ up
+    return float(np.arctan2(np.hypot(x, y), z))
 
 
 def _frame(word: str, ids: np.ndarray, place: str) -> int:
@@ -94,11 +107,52 @@ def _frame(word: str, ids: np.ndarray, place: str) -> int:
 
 
 def _read_control(path: Path, ids: np.ndarray, d: int) -> list[tuple[Any, ...]]:
-    """Rows of a table: a frame, a point in it or nothing, where it lies, a deviation.
+    """Rows: a frame, maybe a point in it, where it lies, maybe a deviation."""
+    out, told = [], None
+    for place, frame, numbers in _table(path, ids):
+        deviation = len(numbers) in (d + 1, 2 * d + 1)
+        if len(numbers) not in (d, d + 1, 2 * d, 2 * d + 1):
+            raise InputError(
+                f"{place}: wanted a frame, {d} coordinates in the world, or {d} in the "
+                f"frame and {d} in the world, and a standard deviation if it is known; "
+                f"found {len(numbers)} numbers."
+            )
+        if told not in (None, deviation):
+            raise InputError(f"{place}: a standard deviation in some rows, not in all.")
+        told = deviation
+        if deviation and numbers[-1] <= 0:
+            raise InputError(f"{place}: wanted a deviation above zero.")
+        *places, sigma = numbers if deviation else np.append(numbers, 0)
+        seen = places[:d] if len(places) == 2 * d else np.zeros(d)
+        row = (frame, np.array(seen), np.array(places[-d:]))
+        out.append((*row, np.eye(d) / sigma**2) if deviation else row)
+    if not out:
+        raise InputError(f"{path}: holds no control points.")
+    return out
+
+
+def _read_levels(path: Path, ids: np.ndarray, d: int) -> list[tuple[Any, ...]]:
+    """Rows: a frame, what points up in it, a deviation in radians."""
+    if d != 3:
+        raise InputError("--level: of what is 3D only, this is 2D.")
+    out = []
+    for place, frame, numbers in _table(path, ids):
+        if len(numbers) != 4 or not numbers[:3].any() or numbers[3] <= 0:
+            raise InputError(
+                f"{place}: wanted a frame, three numbers of the direction that points "
+                "up in it, and a standard deviation above zero, in radians."
+            )
+        out.append((frame, numbers[:3], numbers[3]))
+    if not out:
+        raise InputError(f"{path}: holds no levels.")
+    return out
+
+
+def _table(path: Path, ids: np.ndarray) -> Iterator[tuple[str, int, np.ndarray]]:
+    """Where each row is, its frame, and its numbers.
 
     Words in the first row are the names of the columns.
     """
-    out, told = [], None
     for n, (line, text) in enumerate(text_lines(path)):
         if not text.strip() or text.lstrip().startswith("#"):
             continue
@@ -110,25 +164,9 @@ def _read_control(path: Path, ids: np.ndarray, d: int) -> list[tuple[Any, ...]]:
             if n == 0:
                 continue
             raise InputError(f"{place}: not numbers after the frame: {text}") from None
-        deviation = len(numbers) in (d + 1, 2 * d + 1)
-        if len(numbers) not in (d, d + 1, 2 * d, 2 * d + 1):
-            raise InputError(
-                f"{place}: wanted a frame, {d} coordinates in the world, or {d} in the "
-                f"frame and {d} in the world, and a standard deviation if it is known; "
-                f"found {len(numbers)} numbers."
-            )
-        if told not in (None, deviation):
-            raise InputError(f"{place}: a standard deviation in some rows, not in all.")
-        told = deviation
-        if not np.isfinite(numbers).all() or (deviation and numbers[-1] <= 0):
-            raise InputError(f"{place}: wanted finite numbers, deviations above zero.")
-        *places, sigma = numbers if deviation else np.append(numbers, 0)
-        seen = places[:d] if len(places) == 2 * d else np.zeros(d)
-        row = (_frame(frame, ids, place), np.array(seen), np.array(places[-d:]))
-        out.append((*row, np.eye(d) / sigma**2) if deviation else row)
-    if not out:
-        raise InputError(f"{path}: holds no control points.")
-    return out
+        if not np.isfinite(numbers).all():
+            raise InputError(f"{place}: wanted finite numbers.")
+        yield place, _frame(frame, ids, place), numbers
 
 
 def is_told(known: KnownOfGraph) -> bool:
@@ -137,7 +175,7 @@ def is_told(known: KnownOfGraph) -> bool:
 
 
 def writable(session: Session, known: KnownOfGraph, d: int) -> KnownOfGraph:
-    """What graph.g2o can hold; the points that it cannot are counted."""
+    """What graph.g2o can hold; the points and levels that it cannot are counted."""
     control = [
         row for row in known.control if len(row) > 3 and (d == 3 or not row[1].any())
     ]
@@ -147,17 +185,19 @@ def writable(session: Session, known: KnownOfGraph, d: int) -> KnownOfGraph:
             f"graph.g2o lacks {missing} control points: of no known deviation, or in "
             "2D beside the origin of their frame."
         )
-    return known._replace(control=control)
+    if known.levels:
+        session.console.print(f"graph.g2o lacks {len(known.levels)} levels.")
+    return known._replace(control=control, levels=())
 
 
 def known_entries(
     known: KnownOfGraph, sol: AveragingSolution, report: EdgeReport, ids: np.ndarray
 ) -> list[dict[str, Any]]:
-    """How far each prior and control point is off, and its trust, for result.json."""
+    """How far what is known is off, and its trust, for result.json."""
     if sol.prior_weight is None:
         return []
-    kinds = ["prior"] * len(known.priors) + ["control"] * len(known.control)
-    frames = [row[0] for row in known.priors + known.control]
+    rows = {"prior": known.priors, "control": known.control, "level": known.levels}
+    kinds = [(kind, row[0]) for kind, some in rows.items() for row in some]
     first = len(report.edges) - len(kinds)
     weights = np.asarray(sol.prior_weight)
     return [
@@ -165,10 +205,14 @@ def known_entries(
             "kind": kind,
             "frame": int(ids[frame]),
             "weight": float(weights[n]),
-            "translation": float(report.translation[first + n]),
+            **(
+                {"rotation": float(report.rotation[first + n])}
+                if kind == "level"
+                else {"translation": float(report.translation[first + n])}
+            ),
             "normalised_residual": float(report.normalised[first + n]),
         }
-        for n, (kind, frame) in enumerate(zip(kinds, frames, strict=True))
+        for n, (kind, frame) in enumerate(kinds)
     ]
 
 
@@ -195,20 +239,27 @@ def show_known(
 
 
 def show_entries(session: Session, entries: list[dict[str, Any]]) -> None:
-    """A table of priors and control points; what is not trusted first."""
+    """A table of what is known; what is not trusted first."""
     if not entries:
         return
-    table = Table(title="Priors and control points")
+    table = Table(title="Priors, control points and levels")
     for name in ("", "frame", "off", "normalised", "trusted"):
         table.add_column(name, justify="right")
-    order = sorted(entries, key=lambda x: (x["weight"] > 0.5, -x["translation"]))
+    order = sorted(entries, key=lambda x: x["weight"])
     for entry in order[:20]:
         normalised = entry.get("normalised_residual")
         table.add_row(
             entry["kind"],
             printable(str(entry["frame"])),
-            f"{entry['translation']:.4g}",
+            _off(entry),
             "" if normalised is None else f"{normalised:.2f}",
             "yes" if entry["weight"] > 0.5 else "no",
         )
     session.console.print(table)
+
+
+def _off(entry: dict[str, Any]) -> str:
+    """A length, or of a level an angle."""
+    if "translation" in entry:
+        return f"{entry['translation']:.4g}"
+    return f"{np.rad2deg(entry['rotation']):.4g} deg"

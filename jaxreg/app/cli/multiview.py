@@ -14,6 +14,7 @@ from jaxreg._core.typing import Progress
 from jaxreg.app.cli import outputs
 from jaxreg.app.cli.inputs import Scans, check_point, load_scans, read_positions
 from jaxreg.app.cli.known import (
+    NOTHING,
     is_told,
     known_of_scans,
     of_middles,
@@ -169,7 +170,7 @@ def reconstruct_scans(
     """
     centred, middles = scans.centred()
     eyes = None if viewpoint is None else (viewpoint - middles).astype(centred[0].dtype)
-    known = KnownOfGraph([], [], []) if known is None else known
+    known = NOTHING if known is None else known
     told = of_middles(known, middles)
     kept = None if log is None or log.pairs is None else log.pairs
 
@@ -188,6 +189,7 @@ def reconstruct_scans(
         positions=positions,
         fixed=told.fixed,
         control=told.control,
+        levels=told.levels,
         previous=None if kept is None else jaxreg.RelativeMotions.kept(*kept),
         progress=progress,
         on_pairs=keep,

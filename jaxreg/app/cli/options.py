@@ -51,6 +51,30 @@ class Options:
 
 
 @dataclass(frozen=True, kw_only=True)
+class KnownOptions:
+    """Options of the commands whose answer may lie in a known world.
+
+    A frame is named as the input names it: a scan, or a number of a graph.
+    """
+
+    control: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
+    ] = None
+    """Surveyed points, rows of: frame, [point in it,] point in the world [, sigma]."""
+    level: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
+    ] = None
+    """Tilts that are known, rows of: frame, what points up in it, sigma in radians."""
+    fix: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="FRAME=POSE ...", help_behavior_hint="(default: none)"),
+    ] = ()
+    """Poses that stay: a file of one matrix, or its numbers in quotes."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SearchOptions(Options):
     """Options of the commands that search for poses of scans."""
 
@@ -152,7 +176,7 @@ class Register(ModelOptions):
 
 
 @dataclass(frozen=True)
-class Multiview(ModelOptions):
+class Multiview(ModelOptions, KnownOptions):
     """Bring scans into one frame, without an initial guess."""
 
     scans: Annotated[
@@ -177,16 +201,6 @@ class Multiview(ModelOptions):
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
     ] = None
     """Lines NAME X Y [Z]: about where each scan's scanner stood; see --deviation."""
-    control: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
-    ] = None
-    """Surveyed points, rows of: scan, [point in it,] point in the world [, sigma]."""
-    fix: Annotated[
-        tuple[str, ...],
-        tyro.conf.arg(metavar="SCAN=POSE ...", help_behavior_hint="(default: none)"),
-    ] = ()
-    """Poses that stay: a file of one matrix, or its numbers in quotes."""
     resume: bool = False
     """Go on with the pairs that an interrupted run left in the output folder."""
     view: bool = False
@@ -194,7 +208,7 @@ class Multiview(ModelOptions):
 
 
 @dataclass(frozen=True)
-class Average(Options):
+class Average(Options, KnownOptions):
     """Find poses that agree with the relative motions of a pose graph."""
 
     graph: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="GRAPH")]
@@ -210,16 +224,6 @@ class Average(Options):
         ),
     ] = None
     """Steps of the method, at most."""
-    control: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
-    ] = None
-    """Surveyed points, rows of: frame, [point in it,] point in the world [, sigma]."""
-    fix: Annotated[
-        tuple[str, ...],
-        tyro.conf.arg(metavar="FRAME=POSE ...", help_behavior_hint="(default: none)"),
-    ] = ()
-    """Poses that stay: a file of one matrix, or its numbers in quotes."""
     drop: Annotated[
         tuple[str, ...],
         tyro.conf.arg(metavar="I,J ...", help_behavior_hint="(default: none)"),

@@ -44,26 +44,24 @@ def as_adjusted(
     priors: Told,
     fixed: Told,
     control: Told,
+    levels: Told,
 ) -> tuple[PoseGraph, AveragingSolution, int]:
     """The graph and its solution, or those whose frame 0 is the world.
 
     Returns:
         A graph, its solution, and the frame in it that was frame 0: with knowledge
-        all frames are one further, priors and control points are its last edges, and
-        fixed frames have no edges.
+        all frames are one further, priors, control points and levels are its last
+        edges, and fixed frames have no edges.
     """
     check_solution(graph, solution)
-    known = check_known(priors, fixed, control, graph)
-    num = 0
-    if known is not None:
-        num += len(known.poses.frame)
-        num += 0 if known.points is None else len(known.points.frame)
+    known = check_known(priors, fixed, control, levels, graph)
+    num = 0 if known is None else known.num_rows
     weight = solution.prior_weight
     told = 0 if weight is None else len(weight)
     if told != num:
         raise ValueError(
-            f"solution: {told} priors and control points were averaged, found {num} "
-            "here: give those that `average` was given."
+            f"solution: {told} priors, control points and levels were averaged, found "
+            f"{num} here: give those that `average` was given."
         )
     if known is None:
         return graph, solution, 0
@@ -75,7 +73,8 @@ def as_adjusted(
     whole, told_weight = graph, jnp.zeros(0) if weight is None else weight
     poses = known.poses
     if num:
-        all_of_it = Adjustment(graph, poses, known.points, own, solution.placed)
+        rows = poses, known.points, known.levels
+        all_of_it = Adjustment(graph, *rows, own, solution.placed)
         whole, poses, _ = all_of_it.whole(T)
     whole = anchored(whole, poses)
     eye = jnp.eye(graph.dim + 1, dtype=T.dtype)[None]

@@ -1,9 +1,9 @@
 """Poses adjusted to all that is known of them: one least squares, robust by trust.
 
-Edges keep the trust that averaging gave them. Priors and control points are trusted by
-how far they are off, in standard deviations: by a Welsch kernel that a hundredth of the
-right ones leave. They are believed at their word, unless the middle one of three and
-more shows that their deviations are too small.
+Edges keep the trust that averaging gave them. Priors, control points and levels are
+trusted by how far they are off, in standard deviations: by a Welsch kernel that a
+hundredth of the right ones leave. They are believed at their word, unless the middle
+one of three and more shows that their deviations are too small.
 
 Of two ways to an answer the one that explains more is taken: from where most of what is
 known fits the parts as they are, and, as drift may be larger than a wrong prior, from a
@@ -28,6 +28,7 @@ from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.gauge import average_graph, follow_graph
 from jaxreg.averaging.measures import deviations
 from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM
+from jaxreg.averaging.world.levels import Levels
 from jaxreg.averaging.world.points import ControlPoints
 from jaxreg.averaging.world.rigid_fit import FARTHEST, MEDIAN
 from jaxreg.geometry import lie
@@ -44,7 +45,13 @@ _ENOUGH = 3
 class _Minimum(NamedTuple):
     T_world_i: Float[Array, "v D D"]
     status: StatusArray
-    trust: Float[Array, " n"]  # in edges, priors and points, that it is by
+    trust: Float[Array, " n"]  # in edges and all that is known, that it is by
+
+
+class _Rows(NamedTuple):
+    off: Float[Array, " n"]  # over the middle one of right rows
+    free: int  # components of each
+    told: bool  # whether their deviations are; else they are off in lengths
 
 
 class _Problem(NamedTuple):
@@ -70,12 +77,13 @@ class _Problem(NamedTuple):
 
 
 class Adjustment(eqx.Module):
-    """Edges, priors and points as one graph, by the trust that poses give them.
+    """Edges and what is known as one graph, by the trust that poses give them.
 
     Attributes:
         graph: the relative motions.
         poses: priors and fixed frames.
         points: control points, or None without any.
+        levels: tilts, or None without any.
         edge_weight: `(e,)` trust in the edges, held.
         joined: `(v,)` frames that lie in the world.
     """
@@ -83,15 +91,16 @@ class Adjustment(eqx.Module):
     graph: PoseGraph
     poses: KnownPoses
     points: ControlPoints | None
+    levels: Levels | None
     edge_weight: Float[Array, " e"]
     joined: Bool[Array, " v"]
 
     def solve(
         self, T_start: Float[Array, "v D D"]
     ) -> tuple[Float[Array, "v D D"], StatusArray, Float[Array, " k"]]:
-        """Poses, a status, and the trust in each prior, then in each point.
+        """Poses, a status, and the trust in each prior, then each point, then level.
 
-        Gradients: by the graph, the poses and the points, trust held.
+        Gradients: by the graph and by what is known, trust held.
         """
         fixed, T_start = jax.lax.stop_gradient((self, T_start))
         # The noise of edges is what they show before anything bends them.
@@ -101,7 +110,7 @@ class Adjustment(eqx.Module):
         narrowing = widest ** jnp.maximum(1 - rounds / (_ROUNDS - 2), 0)
         widths = jnp.stack([jnp.ones_like(narrowing), narrowing])
 
-        def one(widths: Array) -> tuple[_Minimum, tuple[Array, Array]]:
+        def one(widths: Array) -> tuple[_Minimum, tuple[Array, ...]]:
             def again(before: _Minimum, width: Array) -> tuple[_Minimum, None]:
                 return fixed._minimum(before.T_world_i, width), None
 
@@ -129,6 +138,8 @@ class Adjustment(eqx.Module):
         known = self._priors(graph)
         if self.points is not None:
             known = joined_priors(known, self.points.as_poses(T, sizes[1]))
+        if self.levels is not None:
+            known = joined_priors(known, self.levels.as_poses(T))
         trust = jnp.exp(-(self._ratios(T, sizes) ** 2) / (2 * width**2))
         trust = jnp.where(self.usable, trust, 0)
         return graph, known, jnp.concatenate([self._edge_trust(), trust])
@@ -182,46 +193,53 @@ class Adjustment(eqx.Module):
 
     @property
     def usable(self) -> Bool[Array, " k"]:
-        """Priors and points that can count: those of free frames in the world."""
-        free = (self.joined & ~self.poses.fixed)[self.poses.frame]
-        if self.points is None:
-            return free
-        return jnp.concatenate([free, self.joined[self.points.frame]])
+        """Rows that can count: of frames in the world, of priors of free ones."""
+        free = self.joined & ~self.poses.fixed
+        each = [free[self.poses.frame]]
+        each += [
+            self.joined[some.frame]
+            for some in (self.points, self.levels)
+            if some is not None
+        ]
+        return jnp.concatenate(each)
 
-    def _misfits(self, T: Array) -> tuple[Array, Array]:
-        """Of priors, over their median; of points, likewise or in lengths."""
+    def _rows(self, T: Array) -> list[_Rows]:
+        """How far priors, points and levels are off."""
         known = self._priors(self._informed(T))
         gap = lie.between(known.T_world_prior, T[known.frame])
         error = lie.log(gap)
         assert known.information is not None
         turned = jnp.sum(known.information * error[:, None], axis=-1)
         sq = jnp.maximum(jnp.sum(error * turned, axis=-1), 0)
-        of_poses = jnp.sqrt(sq) / MEDIAN[error.shape[-1]]
-        if self.points is None:
-            return of_poses, jnp.zeros(0, T.dtype)
-        return of_poses, self.points.misfit(T) / MEDIAN[self.graph.dim]
+        each = [(jnp.sqrt(sq), error.shape[-1], True)]
+        if self.points is not None:
+            told = self.points.information is not None
+            each.append((self.points.misfit(T), self.graph.dim, told))
+        if self.levels is not None:
+            each.append((self.levels.misfit(T), 2, True))
+        return [_Rows(off / MEDIAN[free], free, told) for off, free, told in each]
 
-    def _sizes(self, T: Array) -> tuple[Array, Array]:
-        """Deviations of priors and points: over those that are known, or in lengths."""
-        of_poses, of_points = self._misfits(T)
-        usable, num = self.usable, len(of_poses)
-        points = self.points
-        if points is None or points.information is not None:
-            size = _at_least_one(jnp.concatenate([of_poses, of_points]), usable)
-            return size, size
-        extent = jnp.max(jnp.abs(points.in_world - points.in_world[:1]))
+    def _sizes(self, T: Array) -> tuple[Array, ...]:
+        """Deviations of each kind: over those that are known, or in lengths."""
+        rows, usable = self._rows(T), self.usable
+        count = jnp.asarray([len(row.off) for row in rows])
+        kind = jnp.repeat(jnp.arange(len(rows)), count, total_repeat_length=len(usable))
+        off = jnp.concatenate([row.off for row in rows])
+        told = jnp.asarray([row.told for row in rows])[kind]
+        of_told = _at_least_one(off, usable & told)
+        if self.points is None or rows[1].told:
+            return tuple(of_told for _ in rows)
+        extent = jnp.max(jnp.abs(self.points.in_world - self.points.in_world[:1]))
         least = jnp.maximum(1e-6 * extent, jnp.finfo(T.dtype).tiny ** 0.5)
-        middle = _lower_median(of_points, usable[num:])
-        return _at_least_one(of_poses, usable[:num]), jnp.maximum(middle, least)
+        of_points = jnp.maximum(_lower_median(off, usable & ~told), least)
+        return tuple(of_told if row.told else of_points for row in rows)
 
-    def _ratios(self, T: Array, sizes: tuple[Array, Array]) -> Float[Array, " k"]:
+    def _ratios(self, T: Array, sizes: tuple[Array, ...]) -> Float[Array, " k"]:
         """Misfits over those that a hundredth of right ones exceed."""
-        of_poses, of_points = self._misfits(T)
-        k, d = lie.tangent_dim(self.graph.dim), self.graph.dim
         return jnp.concatenate(
             [
-                of_poses / sizes[0] * (MEDIAN[k] / FARTHEST[k]),
-                of_points / sizes[1] * (MEDIAN[d] / FARTHEST[d]),
+                row.off / size * (MEDIAN[row.free] / FARTHEST[row.free])
+                for row, size in zip(self._rows(T), sizes, strict=True)
             ]
         )
 
@@ -230,8 +248,8 @@ class Adjustment(eqx.Module):
         ratios = jnp.where(self.usable, self._ratios(T, self._sizes(T)), 0)
         return jnp.max(ratios, initial=0)
 
-    def _cost(self, T: Array, sizes: tuple[Array, Array]) -> Float[Array, ""]:
-        """Half of chi-square, of priors and points as far as the kernel counts it."""
+    def _cost(self, T: Array, sizes: tuple[Array, ...]) -> Float[Array, ""]:
+        """Half of chi-square, of what is known as far as the kernel counts it."""
         graph = self._informed(T)
         i, j = graph.edges[:, 0], graph.edges[:, 1]
         error = graph.tangent_errors(T)
@@ -240,9 +258,10 @@ class Adjustment(eqx.Module):
         present = graph.mask & self.joined[i] & self.joined[j]
         weight = jnp.where(present, graph.weight * self._edge_trust(), 0)
         edges = jnp.sum(weight * jnp.sum(error * turned, axis=-1)) / 2
-        k, d, num = lie.tangent_dim(graph.dim), graph.dim, len(self.poses.frame)
         kernel = 1 - jnp.exp(-(self._ratios(T, sizes) ** 2) / 2)
-        most = jnp.where(jnp.arange(len(kernel)) < num, FARTHEST[k], FARTHEST[d]) ** 2
+        most = jnp.concatenate(
+            [jnp.full_like(row.off, FARTHEST[row.free] ** 2) for row in self._rows(T)]
+        )
         return edges + jnp.sum(jnp.where(self.usable, most * kernel, 0))
 
 

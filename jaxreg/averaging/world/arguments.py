@@ -1,4 +1,4 @@
-"""What is known of poses and points, as arrays; a wrong row is refused by its name."""
+"""What is known of the world, as arrays; a wrong row is refused by its name."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,6 +14,7 @@ from jaxreg._core.checks import (
     is_concrete,
     shown,
 )
+from jaxreg.averaging.world.levels import Levels
 from jaxreg.averaging.world.points import ControlPoints
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses
@@ -21,11 +22,12 @@ from jaxreg.graph.pose_graph import PoseGraph
 
 
 class Known(eqx.Module):
-    """Poses and points that are known.
+    """Poses, points and tilts that are known.
 
     Attributes:
         poses: priors and fixed frames, of which there may be none.
         points: control points, or None without any.
+        levels: tilts, or None without any.
         origin: `(d,)` float64 on the host, subtracted from all positions in the world,
             which may be map coordinates; None where a number is traced.
         num_fixed: how many frames are fixed (static).
@@ -33,12 +35,19 @@ class Known(eqx.Module):
 
     poses: KnownPoses
     points: ControlPoints | None
+    levels: Levels | None
     origin: np.ndarray | None
     num_fixed: int = eqx.field(static=True)
 
+    @property
+    def num_rows(self) -> int:
+        """How many priors, points and levels there are."""
+        some = (self.poses, self.points, self.levels)
+        return sum(len(x.frame) for x in some if x is not None)
+
 
 def check_known(
-    priors: object, fixed: object, control: object, graph: PoseGraph
+    priors: object, fixed: object, control: object, levels: object, graph: PoseGraph
 ) -> Known | None:
     """What `average` is told; None if that is nothing."""
     d = graph.dim
@@ -46,17 +55,15 @@ def check_known(
     pose_rows = _rows(priors, "priors", graph, [(D, D), (k, k)])
     fixed_rows = _rows(fixed, "fixed", graph, [(D, D)])
     point_rows = _rows(control, "control", graph, [(d,), (d,), (d, d)])
-    if not (pose_rows or fixed_rows or point_rows):
+    level_rows = _level_rows(levels, graph)
+    if not (pose_rows or fixed_rows or point_rows or level_rows):
         return None
     for name, rows in (("priors", pose_rows), ("fixed", fixed_rows)):
         for n, row in enumerate(rows):
             check_rigid(row[1], f"{name}[{n}]")
     _check_twice(fixed_rows)
-    if point_rows and not (pose_rows or fixed_rows) and len(point_rows) < d:
-        raise ValueError(
-            f"control: wanted at least {d} points, or a prior or a fixed frame beside "
-            f"them, found {len(point_rows)}."
-        )
+    if not (pose_rows or fixed_rows):
+        _check_holds(len(point_rows), len(level_rows), d)
     places = [T[:-1, -1] for _, T, *_ in fixed_rows + pose_rows]
     places += [row[2] for row in point_rows]
     origin = None
@@ -65,7 +72,18 @@ def check_known(
     shift = np.zeros(d) if origin is None else origin
     poses = _known_poses(pose_rows, fixed_rows, shift, graph)
     points = _control_points(point_rows, shift, graph)
-    return Known(poses, points, origin, len(fixed_rows))
+    return Known(poses, points, _levels(level_rows, graph), origin, len(fixed_rows))
+
+
+def _check_holds(num_points: int, num_levels: int, d: int) -> None:
+    """Points that hold a frame without known poses."""
+    least = 2 if num_levels else d
+    if num_points < least:
+        beside = " beside levels" if num_levels else ""
+        raise ValueError(
+            f"control: wanted at least {least} points{beside}, or a prior or a fixed "
+            f"frame, found {num_points}."
+        )
 
 
 def _rows(
@@ -76,7 +94,8 @@ def _rows(
         return []
     if not isinstance(given, Sequence) or isinstance(given, str | bytes):
         raise TypeError(f"{name}: wanted a list of tuples, found {shown(given)}.")
-    least = len(shapes) - (name != "fixed")
+    may_lack = name in ("priors", "control")
+    least = len(shapes) - may_lack
     out = []
     for n, row in enumerate(given):
         at = f"{name}[{n}]"
@@ -98,7 +117,7 @@ def _rows(
         if any(x is None for x in arrays[:least]):
             raise TypeError(f"{at}: wanted {_WANTED[name]}, found None in it.")
         arrays += [None] * (len(shapes) - len(arrays))
-        if name != "fixed":
+        if may_lack:
             eps = float(jnp.finfo(graph.T_i_j.dtype).eps)
             _check_definite(arrays[-1], at, eps)
         out.append((int(frame), *arrays))
@@ -109,7 +128,28 @@ _WANTED = {
     "priors": "(frame, T_world_i) or (frame, T_world_i, information)",
     "fixed": "(frame, T_world_i)",
     "control": "(frame, point in it, point in the world), and an information if known",
+    "levels": "(frame, what points up in it, deviation)",
 }
+
+
+def _level_rows(given: object, graph: PoseGraph) -> list[tuple[Any, ...]]:
+    """Frame, direction of length 1, and deviation."""
+    if given and graph.dim != 3:
+        raise ValueError("levels: wanted a graph in 3D; in 2D nothing can tilt.")
+    rows = _rows(given, "levels", graph, [(graph.dim,), ()])
+    out = []
+    for n, (frame, up, deviation) in enumerate(rows):
+        xp = np if isinstance(up, np.ndarray) else jnp
+        length = xp.sqrt(xp.sum(up**2))
+        if xp is np and not length > 0:
+            raise ValueError(f"levels[{n}]: wanted a direction, found zeros.")
+        if isinstance(deviation, np.ndarray) and not deviation > 0:
+            raise ValueError(
+                f"levels[{n}]: wanted a deviation above zero, in radians, found "
+                f"{deviation:.3g}."
+            )
+        out.append((frame, up / length, deviation))
+    return out
 
 
 def _array(x: object, at: str, shape: tuple[int, ...]) -> Any:
@@ -134,7 +174,8 @@ def _check_definite(information: Any, at: str, eps: float) -> None:
     if not least > eps * most:
         raise ValueError(
             f"{at}: information: wanted a positive definite matrix, found eigenvalues "
-            f"from {least:.3g} to {most:.3g}. Of a position alone `control` is told."
+            f"from {least:.3g} to {most:.3g}. Of a position alone `control` is told, "
+            "of a tilt alone `levels`."
         )
 
 
@@ -217,4 +258,15 @@ def _control_points(
         in_frame=jnp.stack([jnp.asarray(row[1], dtype) for row in rows]),
         in_world=jnp.stack([jnp.asarray(row[2] - origin, dtype) for row in rows]),
         information=jnp.stack([jnp.asarray(x, dtype) for x in given]) if told else None,
+    )
+
+
+def _levels(rows: list[tuple[Any, ...]], graph: PoseGraph) -> Levels | None:
+    if not rows:
+        return None
+    dtype = graph.T_i_j.dtype
+    return Levels(
+        frame=jnp.asarray(np.array([row[0] for row in rows], np.int32)),
+        up=jnp.stack([jnp.asarray(up, dtype) for _, up, _ in rows]),
+        deviation=jnp.stack([jnp.asarray(x, dtype) for *_, x in rows]),
     )

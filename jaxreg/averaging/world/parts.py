@@ -8,6 +8,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
 from jaxreg._core.typing import Scalar
+from jaxreg.averaging.measures import nearest_rank
+from jaxreg.averaging.world.levels import Levels
 from jaxreg.averaging.world.points import ControlPoints
 from jaxreg.averaging.world.rigid_fit import CHOICES, likeliest_place, spans
 from jaxreg.geometry import lie
@@ -20,7 +22,8 @@ class Brought(NamedTuple):
 
     Attributes:
         T_world_i: `(v, d+1, d+1)`, as they were in parts that nothing holds.
-        held: `(v,)` frames of parts that poses hold, or points on no line.
+        held: `(v,)` frames of parts that poses hold, or points on no line, or two
+            points and a level.
     """
 
     T_world_i: Float[Array, "v D D"]
@@ -32,6 +35,7 @@ def brought(
     part: Int[Array, " v"],
     poses: KnownPoses,
     points: ControlPoints | None,
+    levels: Levels | None,
     unit: Scalar,
 ) -> Brought:
     """Each part as one rigid body, where most of what is known of it is fitted.
@@ -42,6 +46,7 @@ def brought(
         part: the lowest number of the frames of each frame's part.
         poses: priors and fixed frames.
         points: control points.
+        levels: tilts.
         unit: the length that stands for a radian.
     """
     v, d = len(part), T_part_i.shape[-1] - 1
@@ -69,9 +74,13 @@ def brought(
         some = tried
         if len(tried) > CHOICES:
             some = tried[_spread(part[poses.frame] == name)]
-        T, agrees = likeliest_place(seen, in_world, usable, some)
-        agrees = agrees & usable & is_point
-        return T, posed[name] | spans(in_world, agrees.astype(T.dtype))
+        up = None if levels is None else _up(levels, T_part_i, part, name)
+        T, agrees, level = likeliest_place(seen, in_world, usable, some, up)
+        agrees = (agrees & usable & is_point).astype(T.dtype)
+        holds = spans(in_world, agrees)
+        if levels is not None:
+            holds = holds | (level & spans(in_world[:, :2], agrees))
+        return T, posed[name] | holds
 
     def one(name: Array) -> tuple[Array, Array]:
         known = jnp.any(part[owner] == name) & (part[name] == name) & ~fixed[name]
@@ -83,6 +92,24 @@ def brought(
     T = product(T_world_part[part], T_part_i)
     T = jnp.where((held & ~fixed[part])[:, None, None], T, T_part_i)
     return Brought(T, held)
+
+
+def _up(
+    levels: Levels, T_part_i: Float[Array, "v D D"], part: Int[Array, " v"], name: Array
+) -> Float[Array, "3"]:
+    """What points up in a part: the level that the middle one of all is nearest to.
+
+    0 for a part without levels.
+    """
+    own = part[levels.frame] == name
+    seen = levels.seen(T_part_i)
+    tried = seen[_spread(own)]
+
+    def middle(up: Array) -> Array:
+        return nearest_rank(jnp.linalg.norm(seen - up, axis=-1), own, 0.5)
+
+    nearest = tried[jnp.argmin(jax.lax.map(middle, tried))]
+    return jnp.where(jnp.any(own), nearest, 0)
 
 
 def _spread(own: Bool[Array, " p"]) -> Int[Array, " m"]:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxreg.averaging.world.levels import turned
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses
 from jaxreg.linear.small import product
@@ -42,7 +43,7 @@ class ControlPoints(eqx.Module):
         off = self.seen(T_world_i) - self.in_world
         if self.information is None:
             return jnp.linalg.norm(off, axis=-1)
-        sq = jnp.sum(off * _turned(self.information, off), axis=-1)
+        sq = jnp.sum(off * turned(self.information, off), axis=-1)
         return jnp.sqrt(jnp.maximum(sq, 0))
 
     def as_poses(
@@ -56,9 +57,7 @@ class ControlPoints(eqx.Module):
         """
         R = lie.rotation(T_world_i[self.frame])
         R_inv = jnp.swapaxes(R, -1, -2)
-        off = jax.lax.stop_gradient(
-            _turned(R_inv, self.seen(T_world_i) - self.in_world)
-        )
+        off = jax.lax.stop_gradient(turned(R_inv, self.seen(T_world_i) - self.in_world))
         J = _by_tangent(self.in_frame + off / 2)
         W, d = self.information, self.in_frame.shape[-1]
         if W is None:
@@ -68,15 +67,11 @@ class ControlPoints(eqx.Module):
         eye = jnp.eye(d + 1, dtype=R.dtype)
         return KnownPoses(
             frame=self.frame,
-            T_world_prior=lie.compose(R, self.in_world - _turned(R, self.in_frame)),
+            T_world_prior=lie.compose(R, self.in_world - turned(R, self.in_frame)),
             information=product(product(jnp.swapaxes(J, -1, -2), W), J),
             fixed=jnp.zeros(len(T_world_i), bool),
             T_world_fixed=jnp.broadcast_to(eye, T_world_i.shape),
         )
-
-
-def _turned(R: Float[Array, "c d d"], x: Float[Array, "c d"]) -> Float[Array, "c d"]:
-    return jnp.sum(R * x[:, None, :], axis=-1)
 
 
 def _by_tangent(u: Float[Array, "c d"]) -> Float[Array, "c d k"]:

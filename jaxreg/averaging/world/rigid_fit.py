@@ -1,4 +1,7 @@
-"""The place of one rigid body that brings it to surveyed points, almost half wrong."""
+"""The place of one rigid body that brings it to surveyed points, almost half wrong.
+
+With a direction that points up, two points suffice.
+"""
 
 import itertools
 import math
@@ -9,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
+from jaxreg.averaging.world.levels import upright
 from jaxreg.geometry import lie
 from jaxreg.geometry.kabsch import kabsch
 
@@ -29,23 +33,35 @@ def likeliest_place(
     in_world: Float[Array, "c d"],
     usable: Bool[Array, " c"],
     also: Float[Array, "n D D"] | None = None,
-) -> tuple[Float[Array, "D D"], Bool[Array, " c"]]:
+    up: Float[Array, "3"] | None = None,
+) -> tuple[Float[Array, "D D"], Bool[Array, " c"], Bool[Array, ""]]:
     """`T_world_body`, the likeliest over the choices, then by all that agree with it.
 
-    Also which agree in the end.
+    Also which agree in the end, and whether `up` was believed.
 
     Args:
         seen: points of the body.
         in_world: where they lie in the world.
         usable: those that count.
         also: more places to try beside those of some points.
+        up: of the body what points up in the world, 0 if that is not known.
     """
     num, d = seen.shape
     rows = jnp.asarray(_choices(num, min(d, num)))
     present = usable.astype(seen.dtype)
+    whole = jnp.all(usable[rows], axis=1)
     tried = jax.vmap(lambda r: kabsch(seen[r], in_world[r], present[r]))(rows)
+    level = jnp.zeros(len(rows), bool)
+    if up is not None:
+        stood = jax.vmap(lambda r: _stood(seen[r], in_world[r], present[r], up))(rows)
+        tried = jnp.concatenate([stood, tried])
+        level = jnp.concatenate([~level, level])
+        whole = jnp.concatenate([whole & jnp.any(up != 0), whole])
     if also is not None:
         tried = jnp.concatenate([tried, also])
+        level = jnp.concatenate([level, jnp.zeros(len(also), bool)])
+        whole = jnp.concatenate([whole, jnp.ones(len(also), bool)])
+    free = jnp.where(level, d + 1, lie.tangent_dim(d)) / d
 
     def squares(T: Array) -> Array:
         return jnp.sum((lie.act(T, seen) - in_world) ** 2, axis=-1)
@@ -54,34 +70,52 @@ def likeliest_place(
     extent = jnp.where(extent > 0, extent, 1)
     # One after the other: of thousands of points memory would not hold all.
     scores, sizes = jax.lax.map(
-        lambda T: _log_evidence(squares(T), present, extent, d), tried
+        lambda x: _log_evidence(squares(x[0]), present, extent, d, x[1]),
+        (tried, free.astype(seen.dtype)),
     )
-    whole = jnp.all(usable[rows], axis=1)
-    if also is not None:
-        whole = jnp.concatenate([whole, jnp.ones(len(also), bool)])
     first = jnp.argmax(jnp.where(whole, scores, -jnp.inf))
     size = sizes[first]
 
     def closer(_: Array, T: Array) -> Array:
         w = jnp.exp(-squares(T) / (FARTHEST[d] * size) ** 2 / 2)
-        return kabsch(seen, in_world, present * w)
+        free = kabsch(seen, in_world, present * w)
+        if up is None:
+            return free
+        return jnp.where(level[first], _stood(seen, in_world, present * w, up), free)
 
     T = control.fori_loop(0, 5, closer, tried[first])
-    return T, usable & (squares(T) < (FARTHEST[d] * size) ** 2)
+    agrees = usable & (squares(T) < (FARTHEST[d] * size) ** 2)
+    return T, agrees, level[first]
+
+
+def _stood(
+    seen: Float[Array, "c 3"],
+    in_world: Float[Array, "c 3"],
+    weight: Float[Array, " c"],
+    up: Float[Array, "3"],
+) -> Float[Array, "4 4"]:
+    """The place that fits the points best of those that have `up` point up."""
+    A = upright(up)
+    turned = jnp.sum(A * seen[:, None, :], axis=-1)
+    flat = kabsch(turned[:, :2], in_world[:, :2], weight)
+    total = jnp.sum(weight)
+    rise = jnp.sum(weight * (in_world - turned)[:, 2]) / jnp.where(total > 0, total, 1)
+    about = jnp.eye(3, dtype=A.dtype).at[:2, :2].set(lie.rotation(flat))
+    return lie.compose(about @ A, jnp.append(lie.translation(flat), rise))
 
 
 def _log_evidence(
-    sq: Float[Array, " c"], present: Array, extent: Array, d: int
+    sq: Float[Array, " c"], present: Array, extent: Array, d: int, free: Array
 ) -> tuple[Array, Array]:
     """The likeliest deviation of right points, and how likely.
 
     A point is right or wrong with even odds, and lies anywhere in the extent if wrong.
-    A motion fits k / d points whatever they are, which are taken off.
+    A motion of k free components fits k / d points whatever they are, which are taken
+    off as `free`.
     """
     deviation = extent * jnp.asarray(_LADDER, sq.dtype)
     gain = d * jnp.log(extent / deviation)
     each = jax.nn.softplus(gain[:, None] - sq / (2 * deviation[:, None] ** 2))
-    free = lie.tangent_dim(d) / d
     total = jnp.sum(present * each, axis=1) - free * gain
     best = jnp.argmax(total)
     return total[best], deviation[best]

@@ -21,7 +21,6 @@ from jaxreg.averaging.gauge import average_graph
 from jaxreg.averaging.world.adjustment import Adjustment
 from jaxreg.averaging.world.arguments import Known
 from jaxreg.averaging.world.parts import brought
-from jaxreg.averaging.world.points import ControlPoints
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import (
     KnownPoses,
@@ -45,7 +44,7 @@ def average_known(
     init: Float[Array, "v D D"] | None,
     key: Key | None,
 ) -> AveragingSolution:
-    """`average` with priors, fixed frames and control points, all checked."""
+    """`average` with priors, fixed frames, control points and levels, all checked."""
     if init is not None and known.origin is not None:
         init = init.at[:, :-1, -1].add(-jnp.asarray(known.origin, init.dtype))
     found = _averaged(graph, method, known, init, key, graph.length_scale)
@@ -72,7 +71,7 @@ def average_in_world(
         label = components(graph.edges, graph.weight, graph.num_poses)
         fixed = fixed_as_priors(known.poses, known.num_fixed)
         held = jax.lax.stop_gradient((init, label, fixed))
-        init = brought(*held, None, unit).T_world_i
+        init = brought(*held, None, None, unit).T_world_i
     return _averaged(graph, method, known, init, None, unit)
 
 
@@ -90,13 +89,12 @@ def _averaged(
         found, part = _of_parts_beside(graph, method, known.poses, init, key)
     else:
         found, part = _of_parts(graph, method, init, key)
-    return _adjusted(graph, known.poses, known.points, found, part, unit)
+    return _adjusted(graph, known, found, part, unit)
 
 
 def _adjusted(
     graph: PoseGraph,
-    poses: KnownPoses,
-    points: ControlPoints | None,
+    known: Known,
     found: AveragingSolution,
     part: Int[Array, " v"],
     unit: Float[Array, ""],
@@ -105,26 +103,29 @@ def _adjusted(
 
     Args:
         graph: the relative motions.
-        poses: priors and fixed frames.
-        points: control points.
+        known: poses, points and levels.
         found: of each part on its own, with the trust in its edges.
         part: the lowest number of the frames of each frame's part.
         unit: the length that stands for a radian.
     """
-    held = jax.lax.stop_gradient((found.T_world_i, part, poses, points))
-    start = brought(*held, jax.lax.stop_gradient(unit))
+    poses, points, levels = known.poses, known.points, known.levels
+    held = jax.lax.stop_gradient((found.T_world_i, part, poses, points, levels, unit))
+    start = brought(*held)
     T, status = found.T_world_i, found.status
     trust = jnp.zeros(0, T.dtype)
-    if len(poses.frame) or points is not None:
-        problem = Adjustment(graph, poses, points, found.edge_weight, start.held)
+    if known.num_rows:
+        told = poses, points, levels
+        problem = Adjustment(graph, *told, found.edge_weight, start.held)
         T, ended, trust = problem.solve(start.T_world_i)
         lost = (ended == Status.MAX_STEPS) | (ended == Status.NON_FINITE)
         status = jnp.where(lost & (status == Status.CONVERGED), ended, status)
         # Where half of what is known contradicts the rest, which is right is chance,
-        # unless fixed frames decide.
-        right, count = jnp.sum(trust > 0.5), jnp.sum(problem.usable)
-        undecided = (count > 1) & (2 * right <= count) & ~jnp.any(poses.fixed)
-        status = jnp.where(undecided, Status.NO_AGREEMENT, status)
+        # unless fixed frames decide. Levels tell nothing of places.
+        num = known.num_rows - (0 if levels is None else len(levels.frame))
+        for kind in (slice(num), slice(num, None)):
+            right, count = jnp.sum(trust[kind] > 0.5), jnp.sum(problem.usable[kind])
+            undecided = (count > 1) & (2 * right <= count) & ~jnp.any(poses.fixed)
+            status = jnp.where(undecided, Status.NO_AGREEMENT, status)
     beside = jnp.any(start.held)
     joined = jnp.where(beside, start.held, part == part[0])
     status = jnp.where(jnp.all(joined), status, Status.DISCONNECTED)

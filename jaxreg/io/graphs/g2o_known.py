@@ -26,11 +26,13 @@ class KnownOfGraph(NamedTuple):
         priors: `(frame, T_world_i, information)` of each.
         fixed: `(frame, T_world_i)` of each.
         control: `(frame, p_i, p_world, information)` of each.
+        levels: `(frame, up_i, deviation)` of each; g2o has no line of these.
     """
 
     priors: list[tuple[Any, ...]]
     fixed: list[tuple[Any, ...]]
     control: list[tuple[Any, ...]]
+    levels: Sequence[tuple[Any, ...]] = ()
 
 
 def known_of(lines: Lines, ids: np.ndarray, vertices: Rows, d: int) -> KnownOfGraph:

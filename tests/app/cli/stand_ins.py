@@ -92,7 +92,7 @@ def fake_reconstruct(
         progress("pairs", 1, 3)
         progress("pairs", 3, 3)
         v = len(scans)
-        told = options.get("control", [])
+        told = [*options.get("control", []), *options.get("levels", [])]
         in_world = bool(told or options.get("fixed"))
         middle = np.zeros(3) if in_world else np.median(CLOUD, axis=0)
         T = np.stack([shift(-middle) @ T_true[i] for i in range(v)])

@@ -49,6 +49,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "no such frame": ([a, "g.g2o", "--fix", "9=1 0 0 0 1 0"], "no '9'; the first"),
         "no pose": ([a, "g.g2o", "--fix", "1"], "wanted NAME=POSE"),
         "no points": ([a, "g.g2o", "--control", "p.csv"], "p.csv, line 2: wanted a"),
+        "flat level": ([a, "g.g2o", "--level", "p.csv"], "--level: of what is 3D only"),
         "no steps": ([a, "g.g2o", "--budget", "0"], "--budget 0: wanted at least 1"),
         "no such device": (["demo", "--device", "tpu"], "--device tpu: JAX finds none"),
         "bad seed": ([m, *pair, "--seed", "-1"], "--seed -1"),
@@ -62,7 +63,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
     }
 
 
-@pytest.mark.parametrize("kind", range(28))
+@pytest.mark.parametrize("kind", range(29))
 def test_bad_input_is_named_in_two_lines_with_exit_code_2(
     folder: Path, capsys: pytest.CaptureFixture[str], kind: int
 ):

@@ -147,8 +147,14 @@ def test_fixed_scans_and_control_points_are_those_of_the_files(
     rows = [",".join(["s2", *map(repr, row)]) for row in rows.tolist()]
     Path("targets.csv").write_text("\n".join(["scan,x,y,z,X,Y,Z,sigma", *rows]))
     np.savetxt("pose.txt", poses[1])
-    run = ["multiview", *scans, "--control", "targets.csv", "--fix"]
+    up = poses[0, 2, :3].tolist()
+    Path("tilts.csv").write_text(f"scan,x,y,z,sigma\ns0,{up[0]},{up[1]},{up[2]},0.01")
+    run = ["multiview", *scans, "--control", "targets.csv", "--level", "tilts.csv"]
+    run.append("--fix")
     assert main([*run, "s1=pose.txt"]) == 0
+    [(frame, direction, deviation)] = given[0][2]["levels"]
+    assert (frame, deviation) == (0, 0.01)
+    np.testing.assert_allclose(direction, up)
     (frame, T), told = given[0][2]["fixed"][0], given[0][2]["control"]
     assert (frame, [row[0] for row in told]) == (1, [2, 2, 2])
     # The solver gets scans about their middles, and the same world.
@@ -167,8 +173,10 @@ def test_fixed_scans_and_control_points_are_those_of_the_files(
     found = json.loads(Path("jaxreg-out/result.json").read_text())
     np.testing.assert_allclose(found["T_world_i"], poses, rtol=0, atol=1e-4)
     assert found["fixed"] == ["s1"]
-    assert [row["frame"] for row in found["known"]] == ["s2"] * 3
-    assert "Priors and control points" in capsys.readouterr().out
+    assert [row["frame"] for row in found["known"]] == ["s2"] * 3 + ["s0"]
+    assert found["known"][3]["kind"] == "level"
+    assert found["known"][3]["rotation"] < 1e-4
+    assert "Priors, control points and levels" in capsys.readouterr().out
     assert main([*run, "s7=pose.txt"]) == 2
     assert "--fix s7=pose.txt: no 's7'; the first are s0" in capsys.readouterr().err
 

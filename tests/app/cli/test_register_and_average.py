@@ -236,7 +236,7 @@ def test_average_goes_into_the_frame_of_what_is_known(
     )
     assert found["fixed"] == [1]
     assert [entry["frame"] for entry in found["known"]] == [0, 2, 2]
-    assert "Priors and control points" in capsys.readouterr().out
+    assert "Priors, control points and levels" in capsys.readouterr().out
     again = jaxreg.io.read_g2o_known("jaxreg-out/graph.g2o")
     assert [frame for frame, _ in again.fixed] == [1]
 
