@@ -122,7 +122,7 @@ class RegistrationSolution(eqx.Module):
         b: `(k,)` its descent direction, nearly zero at a minimum.
         error: that energy, the weighted sum of half squared residuals.
         covariance: `(k, k)` of the pose's error in the same tangent, by a sandwich of
-            estimating equations (`pose_covariance` in `jaxreg.local.curvature`);
+            estimating equations (`pose_covariance` in `jaxreg.local.covariance`);
             lengths are in the unit of the input.
         modes: distinct poses with weights; one for a local method.
         trace: how a particle filter came to rest; None for other methods.
