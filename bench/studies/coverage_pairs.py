@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxreg
@@ -117,7 +117,7 @@ def generated(kind: Kind, num: int, first: int) -> Iterator[CoveragePair]:
             x = kind.surface(rng, n % 8, whole)
             away = x @ rng.normal(size=x.shape[1])
             clouds.append(x[np.argsort(away)[:NUM_POINTS]])
-        near = cKDTree(clouds[0]).query(clouds[0], 5)[0]
+        near = KDTree(clouds[0]).query(clouds[0], 5)[0]
         # Of a curve the next point on either side.
         d = clouds[0].shape[1]
         spacing = np.median(near[:, 2 if d == 2 else 4])

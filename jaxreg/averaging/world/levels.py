@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses
-from jaxreg.graph.pose_graph import product
+from jaxreg.linear.small import product
 
 
 class Levels(eqx.Module):

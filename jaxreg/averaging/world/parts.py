@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.quantile import nearest_rank
 from jaxreg._core.typing import Scalar
-from jaxreg.averaging.measures import nearest_rank
 from jaxreg.averaging.world.levels import Levels
 from jaxreg.averaging.world.points import ControlPoints
 from jaxreg.averaging.world.rigid_fit import CHOICES, likeliest_place, spans
