@@ -50,6 +50,7 @@ from .multiview import ReconstructionSolution as ReconstructionSolution
 from .multiview import RelativeMotions as RelativeMotions
 from .multiview import ScanPositions as ScanPositions
 from .multiview import reconstruct as reconstruct
+from .multiview import scan_covariances as scan_covariances
 from .neighbours import AbstractIndex as AbstractIndex
 from .neighbours import BoxTree as BoxTree
 from .neighbours import BruteForce as BruteForce

@@ -171,6 +171,7 @@ FUNCTIONS = {
     "reconstruct",
     "correspondences",
     "pose_covariances",
+    "scan_covariances",
     "certify",
     "edge_report",
     "sandhu2010",

@@ -6,7 +6,6 @@
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -62,7 +61,7 @@ def _seconds(root: Path, path: str, keys: int) -> float:
     """The median over keys."""
     done = subprocess.run(
         [sys.executable, "-c", _CHILD, str(keys), path],
-        env={**os.environ, "PYTHONPATH": str(root.resolve())},
+        cwd=root,  # whose `jaxreg` comes first
         capture_output=True,
         text=True,
         check=True,

@@ -58,6 +58,8 @@ class Result:
         known: of each control point or level `kind`, `frame`, `weight`, and how far it
             is off, `translation` or `rotation`; None where the frame is that of the
             first scan.
+        covariances: `(v, k, k)` of the poses relative to the first scan of their
+            component, as `scan_covariances` gives them; None if there are too many.
     """
 
     names: list[str]
@@ -78,6 +80,7 @@ class Result:
     aligned: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
     known: list[dict[str, Any]] | None = None
+    covariances: np.ndarray | None = None
 
     @property
     def placed(self) -> np.ndarray:
@@ -241,7 +244,7 @@ def _scan_entry(result: Result, i: int) -> dict[str, Any]:
     status = Status(int(result.scan_status[i]))
     row = result.best_pair(i)
     best = None if row is None else _pair_entry(result, row, motion=False)
-    return {
+    entry = {
         "name": result.names[i],
         "placed": bool(result.placed[i]),
         "component": int(result.component[i]),
@@ -251,6 +254,10 @@ def _scan_entry(result: Result, i: int) -> dict[str, Any]:
         "num_dropped": int(result.num_dropped[i]),
         "best_pair": best,
     }
+    if result.covariances is not None:
+        known = np.isfinite(result.covariances[i]).all()
+        entry["covariance"] = result.covariances[i].tolist() if known else None
+    return entry
 
 
 def _pair_entry(result: Result, e: int, motion: bool = True) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Many scans into one frame."""
 
+from jaxreg.multiview.covariances import scan_covariances as scan_covariances
 from jaxreg.multiview.positions import ScanPositions as ScanPositions
 from jaxreg.multiview.reconstruct import reconstruct as reconstruct
 from jaxreg.multiview.relative_motions import RelativeMotions as RelativeMotions

@@ -32,6 +32,8 @@ from jaxreg.robust import GemanMcClure
 # Kernel widths in sample spacings: first by the voxel tables, then by exact search.
 _TABLE_WIDTHS = (1.4, 1.2, 1.0, 0.8, 0.7, 0.7)
 _EXACT_WIDTHS = (0.7, 0.7, 0.5, 0.5, 0.35, 0.35, 0.35, 0.35)
+#: Of the last step.
+WIDTH_END = _EXACT_WIDTHS[-1]
 
 
 def refine(
@@ -64,7 +66,7 @@ def refine(
 
     placement = averaged(measured(scans, placement, least, exact=False))
     motions = measured(scans, placement, least, exact=True)
-    optimiser, width = _optimiser(motions.T_i_j), _widths(moving, placement)[-1]
+    optimiser, width = optimiser_of(motions.T_i_j), widths_of(moving, placement)[-1]
     motions = follow_points(moving, motions, optimiser, width, least)
     return averaged(motions), motions
 
@@ -102,12 +104,12 @@ def measured(
 ) -> RelativeMotions:
     """The motion and overlap of every pair of a part near the present poses, m = 1."""
     T_world_i = placement.T_world_i
-    widths = _widths(scans, placement, exact=exact)
-    optimiser = _optimiser(T_world_i)
+    widths = widths_of(scans, placement, exact=exact)
+    optimiser = optimiser_of(T_world_i)
 
     def measured(pair: Array) -> Motion:
         i, j = pair
-        problem = _problem(scans, i, j, exact)
+        problem = problem_of(scans, i, j, exact)
         T_i_j = lie.between(T_world_i[i], T_world_i[j])
         return lie.orthonormalise(optimiser.repeat(problem, T_i_j, widths))
 
@@ -125,12 +127,13 @@ def measured(
     return lax.map(one, pairs)
 
 
-def _optimiser(like: Array) -> LocalOptimiser:
+def optimiser_of(like: Array) -> LocalOptimiser:
+    """What the steps are by, in the dtype of the poses."""
     optimiser = LocalOptimiser(PlaneToPlane(0.01), GemanMcClure(), GaussNewton())
     return cast_floats(optimiser, like.dtype)
 
 
-def _widths(
+def widths_of(
     scans: PreparedScans, placement: Placement, *, exact: bool = True
 ) -> Float[Array, " s"]:
     """Kernel widths of the steps."""
@@ -142,7 +145,9 @@ def _widths(
     return spacing * jnp.asarray(factors, spacing.dtype)
 
 
-def _problem(scans: PreparedScans, i: Array, j: Array, exact: bool = False) -> Problem:
+def problem_of(
+    scans: PreparedScans, i: Array, j: Array, exact: bool = False
+) -> Problem:
     """Scan j as the source, scan i as the target."""
     source, target = scans.cloud(j), scans.cloud(i)
     if not exact:

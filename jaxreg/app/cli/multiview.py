@@ -25,7 +25,7 @@ from jaxreg.app.cli.options import Multiview, Order
 from jaxreg.app.cli.runtime import Session, key_of, method_of
 from jaxreg.app.live import LiveView
 from jaxreg.app.pair_log import PairLog, Pairs
-from jaxreg.app.plot.results import result_of
+from jaxreg.app.plot.results import MAX_COVARIANCES, result_of
 from jaxreg.app.result import Result
 from jaxreg.app.versions import version
 from jaxreg.app.views import open_where_seen
@@ -195,6 +195,7 @@ def reconstruct_scans(
         on_pairs=keep,
     )
     result = result_of(sol, scans.points, scans.names)
+    result = dataclasses.replace(result, covariances=_covariances(centred, sol))
     # The frame of a component's first scan; that of a scan alone means nothing.
     first = np.argmax(result.component[:, None] == result.component, axis=1)
     there, i, j = middles[first], *result.edges.T
@@ -212,6 +213,24 @@ def reconstruct_scans(
     entries = known_of_scans(known, T_world_i, sol.prior_weight, result.names)
     held = tuple(result.names[frame] for frame, _ in known.fixed)
     return dataclasses.replace(result, fixed=held, known=entries)
+
+
+def _covariances(
+    scans: list[np.ndarray], sol: jaxreg.ReconstructionSolution
+) -> np.ndarray | None:
+    """Relative to the first scan of each component; None of too many scans."""
+    component = np.asarray(sol.component)
+    if len(scans) > MAX_COVARIANCES or not (component == 0).any():
+        return None
+    firsts = [int(np.argmax(component == c)) for c in range(int(component.max()) + 1)]
+    each = [
+        np.asarray(jaxreg.scan_covariances(scans, sol, relative_to=first), np.float64)
+        for first in firsts
+    ]
+    out = np.full_like(each[0], np.nan)
+    for c, found in enumerate(each):
+        out[component == c] = found[component == c]
+    return out
 
 
 def _check_viewpoint(viewpoint: tuple[float, ...] | None, scans: Scans) -> None:

@@ -13,7 +13,12 @@ from jaxreg.app.colors import scan_colors
 from jaxreg.app.plot.figure import principal_axes, tilt
 from jaxreg.app.plot.report_curves import trace_curves
 from jaxreg.app.plot.report_page import write_page
-from jaxreg.app.plot.report_parts import details_entry, deviations, status_entry
+from jaxreg.app.plot.report_parts import (
+    details_entry,
+    deviations,
+    error_ellipsoid,
+    status_entry,
+)
 from jaxreg.app.plot.report_points import encode_points, page_points
 from jaxreg.app.plot.results import covariances_of, residuals, result_of
 from jaxreg.app.result import Result
@@ -123,12 +128,20 @@ def _page_data(
         "status": status_entry(result.status, at_terminal),
         "camera": None if camera is None else camera.tolist(),
         "points": encode_points(points),
-        "scans": _scan_rows(result, labels, covariances, errors),
+        "scans": _scan_rows(result, clouds, labels, covariances, errors),
         "pairs": _pair_rows(result),
         "modes": _mode_rows(modes) if pair and modes is not None else [],
         "errors": None if errors is None else dict(errors),
         "curves": trace_curves(result.trace),
+        "sigma_by": _sigma_by(result, pair),
     }
+
+
+def _sigma_by(result: Result, pair: bool) -> str:
+    """Where the standard deviations come from."""
+    if pair or result.covariances is not None:
+        return "how the pulls of all points scatter over the cells of the surfaces"
+    return "what the trusted pairs show as noise"
 
 
 def _camera(
@@ -159,6 +172,7 @@ def _title(names: list[str], pair: bool, models: int) -> str:
 
 def _scan_rows(
     result: Result,
+    clouds: list[np.ndarray],
     names: list[str],
     covariances: Any,
     errors: Mapping[str, Any] | None,
@@ -178,6 +192,10 @@ def _scan_rows(
             "T": np.asarray(result.T_world_i[i], float).tolist(),
             "sigma": sigma[i].tolist(),
         }
+        if result.covariances is not None and np.any(result.covariances[i] > 0):
+            row |= error_ellipsoid(
+                result.covariances[i], result.T_world_i[i], clouds[i]
+            )
         if errors is not None and result.names[i] in known:
             k = known[result.names[i]]
             row |= {"e_R": errors["e_R"][k], "e_t": errors["e_t"][k]}

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import scipy.stats
 
 from jaxreg._core.status import Status
 from jaxreg.app.advice import terminal_advice
@@ -27,6 +28,27 @@ def deviations(covariances: Any, num: int) -> np.ndarray:
     return np.sqrt(
         np.stack([variance[:, :d].sum(axis=1), variance[:, d:].sum(axis=1)], axis=1)
     )
+
+
+def error_ellipsoid(
+    covariance: np.ndarray, T_world_i: np.ndarray, points: np.ndarray
+) -> dict[str, Any]:
+    """Where the middle of a scan may lie with 95 %: `middle` and `axes`, in the world.
+
+    Args:
+        covariance: `(k, k)` as `scan_covariances` gives it.
+        T_world_i: the pose.
+        points: `(n, d)` the scan.
+    """
+    d = points.shape[1]
+    R, t = T_world_i[:d, :d], T_world_i[:d, d]
+    middle = points[np.isfinite(points).all(axis=1)].mean(axis=0)
+    value, vector = np.linalg.eigh(covariance[:d, :d])
+    reach = np.sqrt(scipy.stats.chi2.ppf(0.95, d) * np.maximum(value, 0))
+    return {
+        "middle": (R @ middle + t).tolist(),
+        "axes": (R @ vector * reach).T.tolist(),
+    }
 
 
 def details_entry(details: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -81,12 +81,15 @@ def residuals(
 
 
 def covariances_of(result: Result) -> np.ndarray | None:
-    """Covariances `(v, k, k)` of poses by their trusted pairs: `pose_covariances`.
+    """Covariances `(v, k, k)` of poses: its own, else by its trusted pairs.
 
-    The first scan of each component is known exactly, and the noise is what its pairs
+    The latter are those of `pose_covariances`: the first scan of each component is
+    known exactly, and the noise is what its pairs
     show; NaN for components whose trusted pairs close no cycle. None for more than some
     hundred scans.
     """
+    if result.covariances is not None:
+        return result.covariances
     num, D = len(result.names), result.T_world_i.shape[-1]
     k = D * (D - 1) // 2
     if num > MAX_COVARIANCES:

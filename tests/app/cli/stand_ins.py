@@ -121,7 +121,11 @@ def fake_reconstruct(
             prior_weight=jnp.ones(len(told)) if in_world else None,
         )
 
+    def covariances(scans: list[np.ndarray], *_: Any, **__: Any) -> np.ndarray:
+        return np.stack([1e-6 * np.eye(6)] * len(scans))
+
     monkeypatch.setattr(jaxreg, "reconstruct", reconstruct)
+    monkeypatch.setattr(jaxreg, "scan_covariances", covariances)
     return given
 
 

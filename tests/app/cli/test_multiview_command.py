@@ -173,6 +173,7 @@ def test_fixed_scans_and_control_points_are_those_of_the_files(
     found = json.loads(Path("jaxreg-out/result.json").read_text())
     np.testing.assert_allclose(found["T_world_i"], poses, rtol=0, atol=1e-4)
     assert found["fixed"] == ["s1"]
+    np.testing.assert_allclose(found["scans"][2]["covariance"], 1e-6 * np.eye(6))
     assert [row["frame"] for row in found["known"]] == ["s2"] * 3 + ["s0"]
     assert found["known"][3]["kind"] == "level"
     assert found["known"][3]["rotation"] < 1e-4

@@ -233,6 +233,25 @@ def test_scans_in_a_browser(page: Page, tmp_path: Path):
     _quiet(page)
 
 
+def test_errors_of_the_poses_are_drawn_as_ellipsoids(page: Page, tmp_path: Path):
+    scans, result = _result(3, 4, list("abcd"))
+    C = np.zeros((4, 6, 6))
+    C[1:] = np.diag([4e-6, 1e-6, 1e-6, 1e-8, 1e-8, 1e-8])
+    path = tmp_path / "report.html"
+    write_report(path, scans, dataclasses.replace(result, covariances=C))
+    first, second = _data(path)["scans"][:2]
+    assert "axes" not in first
+    R, t = result.T_world_i[1][:3, :3], result.T_world_i[1][:3, 3]
+    np.testing.assert_allclose(second["middle"], R @ scans[1].mean(axis=0) + t)
+    longest = max(second["axes"], key=np.linalg.norm)
+    # The root of the 95 % quantile of chi-square of three degrees of freedom.
+    np.testing.assert_allclose(np.linalg.norm(longest), 2e-3 * 2.796, rtol=1e-3)
+    assert abs(np.dot(longest, R[:, 0])) == pytest.approx(np.linalg.norm(longest))
+    page.open(path)
+    assert "Ellipsoids" in page.run("document.getElementById('hint').textContent")
+    _quiet(page)
+
+
 def test_components_are_shown_in_turn(page: Page, tmp_path: Path):
     scans, result = _result(3, 5, list("abcde"))
     result.component[:] = [0, 0, 0, 1, 1]

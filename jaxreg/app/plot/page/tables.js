@@ -57,8 +57,7 @@ function posesTable() {
   }
   const more = SCANS || DATA.num_poses <= rows.length ? ""
     : ` The first ${rows.length} of ${DATA.num_poses}; poses.tum holds all.`;
-  const noise = SCANS && DATA.modes.length ? "independent errors of the points"
-    : "what the trusted pairs show as noise";
+  const noise = DATA.sigma_by || "what the trusted pairs show as noise";
   const sigma = withSigma ? ` σ is by ${noise}.` : "";
   $("poses-note").textContent = "From each frame to the common one: translation in the " +
     `unit of the input, rotation ${FLAT ? "angle" : "vector"} in degrees.${sigma}${more}`;
