@@ -114,6 +114,15 @@ WORKLOADS = {
         "degrees. Trees are built once, apart. `exact` is the share of answers that "
         "are the closest point.",
     ),
+    "sensor_bound": Workload(
+        "Accuracy beside the bound of the points seen",
+        "The sculpture by a sensor with all its faults: noise that grows with the "
+        "range, mixed pixels at edges, density by range, holes. `over_bound_R` and "
+        "`over_bound_t` are root mean square errors over the bound of Cramer and Rao "
+        "for the points that both, or several, scans see, the surface known exactly: 1 "
+        "is the best there can be. Pairs start 3 degrees and 5 mm off.",
+        quick=False,
+    ),
     "averaging_outliers": Workload(
         "Motion averaging with outliers",
         "Random graphs, noise of 0.5 degrees and 0.5 % of the size, a share of the "
