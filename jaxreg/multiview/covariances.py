@@ -15,10 +15,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import cast_floats
-from jaxreg._core.typing import ArrayLike, Motion
+from jaxreg._core.typing import ArrayLike
 from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import product
+from jaxreg.linear.small import product
 from jaxreg.local.covariance import answer, inverse_within
 from jaxreg.local.steps.base import full_matmul
 from jaxreg.matching.problem import match
@@ -160,11 +160,7 @@ class _Graph(eqx.Module):
 
     def _by_first(self, i: Array, j: Array) -> Float[Array, "k k"]:
         """The error of a motion by the tangent of its first frame."""
-        return -lie.adjoint(self._motion(self.T[i], self.T[j]))
-
-    def _motion(self, T_i: Motion, T_j: Motion) -> Motion:
-        """Of frame i into frame j."""
-        return product(lie.inverse(T_j)[None], T_i[None])[0]
+        return -lie.adjoint(lie.between(self.T[j], self.T[i]))
 
     def _errors(
         self, i: Array, j: Array, around: Float[Array, "r v k"]
@@ -176,7 +172,7 @@ class _Graph(eqx.Module):
 
         def at(move: Float[Array, "v k"]) -> tuple[Array, Array, Array]:
             T_i, T_j = product(self.T[ends], lie.exp(move[ends]))
-            T_i_j = self._motion(T_j, T_i)
+            T_i_j = lie.between(T_i, T_j)
             found = match(problem, T_i_j)
             weight = optimiser.weights(found, width)
             A = answer(optimiser, problem, T_i_j, found, width, weight)
@@ -187,7 +183,7 @@ class _Graph(eqx.Module):
         A, H, pulls = lax.map(at, around)
         each = inverse_within(jnp.mean(A, axis=0), jnp.mean(H, axis=0))
         # From the axes of frame i to those of frame j.
-        R = lie.rotation(self._motion(self.T[j], self.T[i]))
+        R = lie.rotation(lie.between(self.T[i], self.T[j]))
         turn = lie.adjoint(lie.compose(R, jnp.zeros_like(R[0])))
         return jnp.einsum("rca,ab->rcb", pulls, full_matmul(each, turn))
 
