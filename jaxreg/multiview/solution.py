@@ -94,9 +94,10 @@ class ReconstructionSolution(eqx.Module):
         if self.status.ndim:
             batch = f"batch={self.status.shape}, {counted(self.status)}"
             return f"ReconstructionSolution({batch})"
-        others = np.bincount(np.asarray(self.component) + 1)[2:]
+        component = np.asarray(self.component)
+        others = np.bincount(component + 1)[2:]
         more = f", apart from them {' and '.join(map(str, others))}"
-        left = np.asarray(self.scan_status)[~np.asarray(self.placed)]
+        left = np.asarray(self.scan_status)[component < 0]
         left = f" ({counted(left)})" if len(left) else ""
         return (
             f"ReconstructionSolution({Status(int(self.status)).name}, "

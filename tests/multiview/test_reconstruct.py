@@ -287,6 +287,7 @@ def test_scans_in_another_unit_are_left_out(sculpture):
     for i in (3, 6):
         assert Status(int(sol.scan_status[i])) == Status.UNIT_DIFFERS
         assert not sol.placed[i]
+    assert "UNIT_DIFFERS 2" in repr(sol)
     assert np.array(_errors(sol, truth))[np.asarray(sol.placed), 0].max() < 0.02
     assert np.sum(sol.placed) >= 5
 
