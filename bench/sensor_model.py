@@ -50,9 +50,15 @@ class SensorScan(NamedTuple):
     beam: np.ndarray
     deviation: np.ndarray
 
+    def drawn(self, rng: np.random.Generator, num: int) -> "SensorScan":
+        """Of so many points at most."""
+        rows = rng.permutation(len(self.points))[:num]
+        each = ("points", "true", "normal", "beam", "deviation")
+        return self._replace(**{name: getattr(self, name)[rows] for name in each})
+
 
 def sensor_scans(
-    num_views: int, seed: int, noise: float = 2e-4, pixels: int = 110
+    num_views: int, seed: int, noise: float = 2e-4, pixels: int = 110, num: int = 1400
 ) -> list[SensorScan]:
     """Views from all around, at distances of 0.45 to 0.8 m.
 
@@ -61,6 +67,7 @@ def sensor_scans(
         seed: of all that is random.
         noise: deviation of a range of 0.6 m, in metres.
         pixels: on a side of the square field of view.
+        num: points that are drawn of a scan with more, so that few programs compile.
     """
     rng = np.random.default_rng(seed)
     turn = np.arange(num_views) / num_views
@@ -68,7 +75,7 @@ def sensor_scans(
     elevation = np.deg2rad(10 + 40 * np.sin(4 * np.pi * turn + 1))
     frames = random_motions(rng, num_views, 3, spread=0.1)
     return [
-        _scan(rng, a, e, T, noise, pixels)
+        _scan(rng, a, e, T, noise, pixels).drawn(rng, num)
         for a, e, T in zip(azimuth, elevation, frames, strict=True)
     ]
 

@@ -58,11 +58,15 @@ def cases(options: Options) -> Iterator[Case]:
 
 def _near(source: SensorScan, target: SensorScan, seed: int) -> np.ndarray:
     """The source's points, near where they belong in the frame of the target."""
+    T = _off(seed) @ _true(source, target)
+    return (source.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+
+
+def _off(seed: int) -> np.ndarray:
+    """By 3 degrees and 5 mm."""
     rng = np.random.default_rng(seed)
     turn, shift = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 3)))
-    off = exponential(np.append(5e-3 * shift, np.radians(3) * turn))
-    T = off @ _true(source, target)
-    return (source.points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    return exponential(np.append(5e-3 * shift, np.radians(3) * turn))
 
 
 def _true(source: SensorScan, target: SensorScan) -> np.ndarray:
@@ -83,10 +87,7 @@ def _judged_pairs(
 ) -> Judged:
     errors, bounds = [], []
     for n, ((source, target), T) in enumerate(zip(pairs, answers, strict=True)):
-        rng = np.random.default_rng(n)
-        turn, shift = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 3)))
-        off = exponential(np.append(5e-3 * shift, np.radians(3) * turn))
-        found = np.asarray(T, np.float64) @ off @ _true(source, target)
+        found = np.asarray(T, np.float64) @ _off(n) @ _true(source, target)
         # As a motion of the world, which the source's points are moved by.
         D = target.T_world_scan @ found @ np.linalg.inv(source.T_world_scan)
         middle = source.true.mean(axis=0)
