@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from jaxreg._core.status import Status
 from jaxreg.app.advice import terminal_advice
@@ -44,7 +44,7 @@ def error_ellipsoid(
     R, t = T_world_i[:d, :d], T_world_i[:d, d]
     middle = points[np.isfinite(points).all(axis=1)].mean(axis=0)
     value, vector = np.linalg.eigh(covariance[:d, :d])
-    reach = np.sqrt(scipy.stats.chi2.ppf(0.95, d) * np.maximum(value, 0))
+    reach = np.sqrt(scipy.special.chdtri(d, 0.05) * np.maximum(value, 0))
     return {
         "middle": (R @ middle + t).tolist(),
         "axes": (R @ vector * reach).T.tolist(),

@@ -1,0 +1,20 @@
+"""What a start imports: seconds of it are seconds of every command."""
+
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize("command", ["register", "multiview", "average"])
+def test_commands_start_without_what_only_pictures_need(command: str):
+    slow = "scipy.stats", "scipy.spatial", "scipy.optimize", "plotly", "viser", "torch"
+    code = f"""
+import sys
+import jaxreg.app.cli.{command}
+print(*(name for name in {slow} if name in sys.modules))
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == []
