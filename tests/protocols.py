@@ -150,6 +150,7 @@ DYNAMICS = [
     particle.StochasticDynamics(),
     particle.StochasticDynamics(0.5, particle.EnsembleSpread()),
     particle.StochasticDynamics(spread=particle.PathSpread()),
+    particle.StochasticDynamics(spread=particle.MeasuredSpread()),
 ]
 ENERGIES = [
     particle.AbsoluteEnergy(),

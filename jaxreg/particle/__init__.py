@@ -4,6 +4,7 @@ from jaxreg.particle.base import AbstractSearch as AbstractSearch
 from jaxreg.particle.dynamics import AbstractDynamics as AbstractDynamics
 from jaxreg.particle.dynamics import ConstantVelocity as ConstantVelocity
 from jaxreg.particle.dynamics import EnsembleSpread as EnsembleSpread
+from jaxreg.particle.dynamics import MeasuredSpread as MeasuredSpread
 from jaxreg.particle.dynamics import NoDynamics as NoDynamics
 from jaxreg.particle.dynamics import OwnSpread as OwnSpread
 from jaxreg.particle.dynamics import PathSpread as PathSpread

@@ -29,6 +29,7 @@ from jaxreg._core.checks import (
     check_pair,
     check_parts,
     check_shares,
+    shown,
 )
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key, Motion
@@ -73,6 +74,7 @@ class ParticleFilter(AbstractFilter):
             paper.
         max_points: both clouds are thinned to about this many points.
         batch_size: particles in one vectorised block; small enough for a CPU's cache.
+        dim: of the points that the settings are for, 2 or 3; None for both.
         prior: where the particles start; None is `GaussianPrior()` around `init` where
             that is given, else `UniformPrior()`.
         dynamics: how they move between measurements.
@@ -94,7 +96,8 @@ class ParticleFilter(AbstractFilter):
             the default 269 of 280 right answers were believed, and none of 128 wrong
             ones (bench/studies/evidence.md).
 
-    Raises: ValueError while constructing, for counts that leave nothing to do.
+    Raises: ValueError while constructing, for counts that leave nothing to do; for
+    points of another dimension than `dim`.
 
     Fails: TOO_FEW_POINTS; NON_FINITE where no energy is finite; LOW_OVERLAP where the
     evidence is below `min_log_evidence`; AMBIGUOUS where a second mode is as likely,
@@ -123,6 +126,7 @@ class ParticleFilter(AbstractFilter):
     num_agreeing: int = eqx.field(default=4, static=True)
     max_points: int = eqx.field(default=4096, static=True)
     batch_size: int = eqx.field(default=32, static=True)
+    dim: int | None = eqx.field(default=None, static=True)
     prior: AbstractPrior | None = None
     dynamics: AbstractDynamics = eqx.field(default_factory=StochasticDynamics)
     resampler: AbstractResampler = eqx.field(default_factory=Systematic)
@@ -147,6 +151,10 @@ class ParticleFilter(AbstractFilter):
             raise ValueError(
                 "ParticleFilter: num_particles: wanted from 2 to num_prior = "
                 f"{self.num_prior}, found {self.num_particles}."
+            )
+        if self.dim not in (None, 2, 3):
+            raise ValueError(
+                f"ParticleFilter: dim: wanted None, 2 or 3, found {shown(self.dim)}."
             )
         check_shares(self, "sample_share")
         check_not_negative(self, "prior_error_share")

@@ -1,5 +1,7 @@
 """What a particle filter carries from step to step, and what it tells of one."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,6 +22,9 @@ class Particles(eqx.Module):
         log_weight: `(p,)` normalised; -inf for rows that are not in use.
         path: `(p, times, k)` motion errors of a particle's ancestors and its own, or
             None where the dynamics do not ask for them.
+        error_moment: `(k, k)` mean of e e^T over all that were measured at the time
+            before, as they were before resampling. There when the dynamics are called
+            in a filter, else None.
     """
 
     T_target_source: Float[Array, "*p D D"]
@@ -27,6 +32,7 @@ class Particles(eqx.Module):
     energy: Float[Array, "*p"]
     log_weight: Float[Array, "*p"]
     path: Float[Array, "*p times k"] | None = None
+    error_moment: Float[Array, "k k"] | None = None
 
     @classmethod
     def at(
@@ -73,6 +79,12 @@ class Particles(eqx.Module):
         path = self.path.at[:, time].set(self.motion_error)
         return eqx.tree_at(lambda p: p.path, self, path)
 
+    def told(self, before: "Particles") -> "Particles":
+        """With the mean of e e^T of the particles that these were resampled from."""
+        live = before.log_weight > -jnp.inf
+        moment = moment_of(before.motion_error, live.astype(before.energy.dtype))
+        return dataclasses.replace(self, error_moment=moment)
+
     def valued(self, energy: Float[Array, " p"]) -> "Particles":
         """The same with other energies."""
         return eqx.tree_at(lambda p: p.energy, self, energy)
@@ -81,6 +93,17 @@ class Particles(eqx.Module):
     def measurement(self) -> Motion:
         """z_t: the pose of least energy (PF paper, section 3.3, step 4)."""
         return self.T_target_source[jnp.argmin(self.energy)]
+
+
+def moment_of(
+    error: Float[Array, "p k"], weight: Float[Array, " p"]
+) -> Float[Array, "k k"]:
+    """The mean of e e^T by weight; zero where there is none."""
+    # Rows out of use have no weight, but may hold errors that are not finite.
+    error = jnp.where((weight > 0)[:, None] & jnp.isfinite(error), error, 0)
+    total = jnp.sum(weight)
+    weight = weight / jnp.where(total > 0, total, 1)
+    return jnp.einsum("p,pi,pj->ij", weight, error, error)
 
 
 class ParticleState(eqx.Module):

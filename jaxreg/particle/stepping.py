@@ -44,6 +44,7 @@ class AbstractFilter(AbstractSearch):
     num_prior: eqx.AbstractVar[int]
     num_particles: eqx.AbstractVar[int]
     num_times: eqx.AbstractVar[int]
+    dim: eqx.AbstractVar[int | None]
     prior_steps: eqx.AbstractVar[int]
     inner_steps: eqx.AbstractVar[int]
     num_agreeing: eqx.AbstractVar[int]
@@ -75,7 +76,16 @@ class Filtering(eqx.Module):
 
     @classmethod
     def of(cls, method: AbstractFilter, problem: Problem) -> "Filtering":
-        """With the settings in the dtype of the problem."""
+        """With the settings in the dtype of the problem.
+
+        Raises: ValueError for points of a dimension that the method is not set for.
+        """
+        d = problem.source.shape[0]
+        if method.dim not in (None, d):
+            raise ValueError(
+                f"{type(method).__name__}: dim: set for points of dimension "
+                f"{method.dim}, found points of dimension {d}."
+            )
         return cls(cast_floats(method, problem.source.dtype), problem)
 
     def init(self, key: Key, init: Motion | None = None) -> ParticleState:
@@ -131,7 +141,8 @@ class Filtering(eqx.Module):
             num,
             may_keep=(time != 1) | (method.num_prior == num),
         )
-        T_predicted = method.dynamics(key_predict, particles, time)
+        told = particles.told(state.particles)
+        T_predicted = method.dynamics(key_predict, told, time)
         width = self.width(time)
         particles = measure(
             problem,

@@ -10,6 +10,7 @@ from jaxreg.local import decoupled_error, turn_and_shift
 from jaxreg.particle import (
     ConstantVelocity,
     EnsembleSpread,
+    MeasuredSpread,
     NoDynamics,
     OwnSpread,
     Particles,
@@ -24,6 +25,7 @@ ERROR = 0.1 * RNG.standard_normal((P, 6))
 PATH = 0.1 * RNG.standard_normal((P, 4, 6))
 PATH[:, TIME:] = 0
 WEIGHT = np.array([0.6, 0.4, 0.0])
+SPREADS = [OwnSpread(), EnsembleSpread(), MeasuredSpread(), PathSpread()]
 
 
 def _particles(num: int = P) -> Particles:
@@ -61,12 +63,14 @@ def test_constant_velocity_repeats_the_motion_error():
     np.testing.assert_allclose(step, ERROR, atol=1e-6)
 
 
-@pytest.mark.parametrize("spread", [OwnSpread(), EnsembleSpread(), PathSpread()])
+@pytest.mark.parametrize("spread", SPREADS, ids=lambda s: type(s).__name__)
 def test_the_diffusion_has_the_covariance_of_the_motion_error(spread):
     outer = ERROR[:, :, None] * ERROR[:, None, :]
     S = {
         OwnSpread: outer,
         EnsembleSpread: np.tensordot(WEIGHT, outer, 1)[None].repeat(P, 0),
+        # Alone, particles are all that were measured.
+        MeasuredSpread: np.tensordot(WEIGHT, outer, 1)[None].repeat(P, 0),
         PathSpread: np.einsum("pti,ptj->pij", PATH, PATH) / TIME,
     }[type(spread)]
     step = _steps(StochasticDynamics(0.5, spread))
@@ -76,7 +80,7 @@ def test_the_diffusion_has_the_covariance_of_the_motion_error(spread):
     np.testing.assert_allclose(found, 0.25 * S, atol=0.03 * size)
 
 
-@pytest.mark.parametrize("spread", [OwnSpread(), EnsembleSpread(), PathSpread()])
+@pytest.mark.parametrize("spread", SPREADS, ids=lambda s: type(s).__name__)
 def test_the_diffusion_dies_with_the_motion_error(spread):
     T = jnp.asarray(np.stack([motion(i, 2) for i in range(P)]), jnp.float32)
     still = Particles.at(T, P, num_times=3)
@@ -84,6 +88,19 @@ def test_the_diffusion_dies_with_the_motion_error(spread):
     moved = dynamics(jax.random.key(0), still, jnp.asarray(0))
     np.testing.assert_allclose(moved, T, atol=1e-6)
     assert dynamics.needs_path == isinstance(spread, PathSpread)
+
+
+def test_particles_that_resampling_drops_widen_the_measured_spread():
+    before = _particles()
+    kept = before.rows(jnp.zeros(P * DRAWS, int)).told(before)
+    T = StochasticDynamics(spread=MeasuredSpread())(
+        jax.random.key(0), kept, jnp.asarray(TIME)
+    )
+    step = np.asarray(jax.vmap(decoupled_error)(T, kept.T_target_source))
+    found = step.T @ step / len(step)
+    # The third had no weight: it was not in use.
+    S = np.mean(ERROR[:2, :, None] * ERROR[:2, None, :], axis=0)
+    np.testing.assert_allclose(found, S, atol=0.03 * np.abs(S).max())
 
 
 def test_the_ensemble_ignores_particles_without_weight():

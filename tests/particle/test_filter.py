@@ -26,6 +26,7 @@ from jaxreg.particle import (
     EnsembleSpread,
     GaussianPrior,
     GivenParticles,
+    MeasuredSpread,
     Multinomial,
     MultiStart,
     NoDynamics,
@@ -235,8 +236,29 @@ def test_the_papers_settings():
     assert isinstance(solid.dynamics, ConstantVelocity)
     assert isinstance(flat.energy, SquaredEnergy)
     assert flat.refine_steps == 0
+    assert isinstance(flat.dynamics, StochasticDynamics)
+    assert isinstance(flat.dynamics.spread, MeasuredSpread)
     with pytest.raises(ValueError, match="d must be 2 or 3, found 4"):
         sandhu2010(4)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_papers_settings_are_for_points_of_their_dimension(d):
+    points, other = blob(N, d), 5 - d
+    with pytest.raises(ValueError, match=f"of dimension {other}, found .* {d}"):
+        register(points, points, sandhu2010(other), key=KEY)
+    with pytest.raises(ValueError, match=f"of dimension {other}, found .* {d}"):
+        sandhu2010(other).iteration(points, points, key=KEY)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_papers_settings_say_that_too_few_points_tell_no_rotation(d):
+    few = np.arange(N)[:, None] < d
+    points = np.where(few, blob(N, d), 0)
+    paper = sandhu2010(d, 8, num_times=1)
+    found = register(points, points, paper, key=KEY, source_mask=few[:, 0])
+    assert found.status == Status.TOO_FEW_POINTS
+    np.testing.assert_array_equal(found.T_target_source, np.eye(d + 1))
 
 
 class _Constant(AbstractEnergy):

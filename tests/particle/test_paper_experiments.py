@@ -34,8 +34,8 @@ from jaxreg.particle import (
     AbstractDynamics,
     AbstractSearch,
     ConstantVelocity,
-    EnsembleSpread,
     GaussianPrior,
+    MeasuredSpread,
     NoDynamics,
     StochasticDynamics,
     sandhu2010,
@@ -51,7 +51,7 @@ TRIALS = 12
 class _AnyOf(AbstractDynamics):
     """No dynamics, constant velocity, diffusion: one by a traced number.
 
-    They compile together. S of the diffusion is that of all particles.
+    They compile together. S of the diffusion is that of all particles measured.
     """
 
     which: Array
@@ -61,7 +61,7 @@ class _AnyOf(AbstractDynamics):
         return False
 
     def __call__(self, key, particles, time):
-        diffusion = StochasticDynamics(jnp.float32(1), EnsembleSpread())
+        diffusion = StochasticDynamics(jnp.float32(1), MeasuredSpread())
         three = (NoDynamics(), ConstantVelocity(), diffusion)
         return jnp.stack([one(key, particles, time) for one in three])[self.which]
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Key
 from jaxreg.linear.small import eigh
-from jaxreg.particle.state import Particles
+from jaxreg.particle.state import Particles, moment_of
 
 
 class AbstractSpread(BriefModule):
@@ -45,15 +45,32 @@ class OwnSpread(AbstractSpread):
 
 
 class EnsembleSpread(AbstractSpread):
-    """S = sum_i w_i e_i e_i^T over the particles, the same for all."""
+    """S = sum_i w_i e_i e_i^T over the particles as resampled, the same for all."""
 
     def draw(
         self, key: Key, particles: Particles, time: Int[Array, ""]
     ) -> Float[Array, "p k"]:
         """Normal vectors times a root of S."""
         error = particles.motion_error
-        root = _root_of_covariance(error, jnp.exp(particles.log_weight))
-        return jax.random.normal(key, error.shape, error.dtype) @ root.T
+        S = moment_of(error, jnp.exp(particles.log_weight))
+        return jax.random.normal(key, error.shape, error.dtype) @ _root(S).T
+
+
+class MeasuredSpread(AbstractSpread):
+    """S = the mean of e e^T over all particles measured, before resampling.
+
+    Those that are about to be dropped have often moved farthest, so it is wider than
+    `EnsembleSpread` and lives longer: particles leave local minima by it.
+    """
+
+    def draw(
+        self, key: Key, particles: Particles, time: Int[Array, ""]
+    ) -> Float[Array, "p k"]:
+        """Normal vectors times a root of S."""
+        error, S = particles.motion_error, particles.error_moment
+        if S is None:
+            S = moment_of(error, jnp.exp(particles.log_weight))
+        return jax.random.normal(key, error.shape, error.dtype) @ _root(S).T
 
 
 class PathSpread(AbstractSpread):
@@ -72,12 +89,7 @@ class PathSpread(AbstractSpread):
         return sums / jnp.sqrt(jnp.maximum(time, 1).astype(path.dtype))
 
 
-def _root_of_covariance(
-    error: Float[Array, "p k"], weight: Float[Array, " p"]
-) -> Float[Array, "k k"]:
-    """L with L L^T = sum_i w_i e_i e_i^T; singular where the errors span less."""
-    # Rows out of use have no weight, but may hold errors that are not finite.
-    error = jnp.where((weight > 0)[:, None] & jnp.isfinite(error), error, 0)
-    S = jnp.einsum("p,pi,pj->ij", weight, error, error)
+def _root(S: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    """L with L L^T = S; singular where the errors span less."""
     value, vector = eigh(S)
     return vector * jnp.sqrt(jnp.maximum(value, 0))

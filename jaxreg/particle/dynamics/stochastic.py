@@ -21,7 +21,8 @@ class StochasticDynamics(AbstractDynamics):
     Attributes:
         scale: alpha of Eq. 8, one in the paper.
         spread: over what the expectation is taken, which the paper leaves open:
-            `OwnSpread()`, `EnsembleSpread()` or `PathSpread()`.
+            `OwnSpread()`, `PathSpread()`, `EnsembleSpread()` or
+            `MeasuredSpread()`.
     """
 
     scale: Array | float = traced(1.0)
