@@ -108,6 +108,17 @@ WORKLOADS = {
         "units.",
         quick=False,
     ),
+    "paper_readings": Workload(
+        "Readings of both papers",
+        "What the papers leave open, varied one at a time around what comes nearest to "
+        "their figures; the documentation's page on readings has the sentence that "
+        "each rests on. Table 1: `t` is by how much the model's middle is put wrong, "
+        "`theta` by how much the angle of rotation is too large, `axis` the length of "
+        "the difference of the axes. Tables II and III: graphs drawn with the errors "
+        "of Table II, then motions that `reconstruct` finds; all but LRS start from "
+        "its poses.",
+        quick=False,
+    ),
     "neighbours": Workload(
         "Closest points",
         "Targets on a sculpture; queries near its surface and after a turn of 10 "

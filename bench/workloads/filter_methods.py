@@ -40,14 +40,14 @@ PAPER = "paper's setting"
 WHOLE = Tried("ParticleFilter(), no guess", ParticleFilter(), False)
 
 # Displacements are up to 0.7 radii of the words and 1.05 rad.
-_LETTER = GaussianPrior(0.5, 0.6)
+LETTER_PRIOR = GaussianPrior(0.5, 0.6)
 # Up to 1.4 radii of the cube and 1.05 rad.
-_CUBE = GaussianPrior(1.0, 0.6)
+CUBE_PRIOR = GaussianPrior(1.0, 0.6)
 # 1.9 radii of the truck and 1.05 rad. With one radius, particles start near the truth
 # and two of three searches succeed without dynamics.
-_TRUCK = GaussianPrior(0.8, 0.5)
+TRUCK_PRIOR = GaussianPrior(0.8, 0.5)
 # Translations are N(0, 45), 0.8 radii of the horse in each direction; turns up to 1.05.
-_HORSE = GaussianPrior(0.8, 0.6)
+HORSE_PRIOR = GaussianPrior(0.8, 0.6)
 
 
 def _ours(prior: GaussianPrior) -> list[Tried]:
@@ -66,8 +66,8 @@ def _correlation(*bandwidths: float) -> list[Tried]:
 
 
 _IN_WORDS = [
-    Tried(PAPER, sandhu2010(2, 200, prior=_LETTER)),
-    *_ours(_LETTER),
+    Tried(PAPER, sandhu2010(2, 200, prior=LETTER_PRIOR)),
+    *_ours(LETTER_PRIOR),
     WHOLE,
     *_correlation(1.0, 2.0, 3.0, 5.0, 10.0, 20.0),
 ]
@@ -75,38 +75,40 @@ _IN_WORDS = [
 _ON_CUBE = [
     Tried(
         PAPER,
-        replace(sandhu2010(3, 100, prior=_CUBE), prior_steps=7, inner_steps=7),
+        replace(sandhu2010(3, 100, prior=CUBE_PRIOR), prior_steps=7, inner_steps=7),
     ),
-    Tried(f"{PAPER}, R = 3", sandhu2010(3, 100, prior=_CUBE)),
-    *_ours(_CUBE),
+    Tried(f"{PAPER}, R = 3", sandhu2010(3, 100, prior=CUBE_PRIOR)),
+    *_ours(CUBE_PRIOR),
     *_correlation(1.0, 2.0, 3.0, 5.0, 10.0, 20.0),
 ]
 _ON_TRUCK = [
-    Tried(PAPER, sandhu2010(3, 100, prior=_TRUCK)),
-    Tried(f"{PAPER}, no dynamics", sandhu2010(3, 100, NoDynamics(), prior=_TRUCK)),
+    Tried(PAPER, sandhu2010(3, 100, prior=TRUCK_PRIOR)),
+    Tried(f"{PAPER}, no dynamics", sandhu2010(3, 100, NoDynamics(), prior=TRUCK_PRIOR)),
     Tried(
         f"{PAPER}, constant velocity",
-        sandhu2010(3, 100, ConstantVelocity(), prior=_TRUCK),
+        sandhu2010(3, 100, ConstantVelocity(), prior=TRUCK_PRIOR),
     ),
     Tried(
         f"{PAPER}, S of all particles",
-        sandhu2010(3, 100, StochasticDynamics(spread=EnsembleSpread()), prior=_TRUCK),
+        sandhu2010(
+            3, 100, StochasticDynamics(spread=EnsembleSpread()), prior=TRUCK_PRIOR
+        ),
     ),
-    *_ours(_TRUCK),
+    *_ours(TRUCK_PRIOR),
     # As many look-ups, spent otherwise.
     Tried(
         "ParticleFilter(), 1024 drawn, 288 carried",
-        ParticleFilter(num_prior=1024, num_particles=288, prior=_TRUCK),
+        ParticleFilter(num_prior=1024, num_particles=288, prior=TRUCK_PRIOR),
     ),
     Tried(
         "ParticleFilter(), 1024 drawn, 9 steps each",
-        ParticleFilter(num_prior=1024, prior_steps=9, prior=_TRUCK),
+        ParticleFilter(num_prior=1024, prior_steps=9, prior=TRUCK_PRIOR),
     ),
     *_correlation(0.1, 0.25, 0.5, 1.0, 2.0, 4.0),
 ]
 #: By the names of the experiments.
 METHODS = {"letter": _IN_WORDS, "cube": _ON_CUBE, "truck": _ON_TRUCK}
-HORSE = [Tried(PAPER, sandhu2010(3, 40, prior=_HORSE)), WHOLE]
+HORSE = [Tried(PAPER, sandhu2010(3, 40, prior=HORSE_PRIOR)), WHOLE]
 
 
 def look_ups(registrar: AbstractRegistrar, trials: Trials) -> int:

@@ -50,8 +50,8 @@ def cases(options: Options) -> Iterator[Case]:
             name=name,
             data=f"generated, {n} points on {m}, found within {trials.degrees:g} "
             f"degrees and a shift of {trials.shift:g}",
-            methods=[_method(tried, trials) for tried in METHODS[name]],
-            trials=_arguments(trials),
+            methods=[method_of(tried, trials) for tried in METHODS[name]],
+            trials=arguments(trials),
             judge=partial(judge, trials),
             reference=PAPER,
         )
@@ -66,7 +66,7 @@ def cases(options: Options) -> Iterator[Case]:
             published(noise),
         ]
         yield _noisy(name, data, noise, quick, many)
-        slow = [_method(tried, few) for tried in HORSE]
+        slow = [method_of(tried, few) for tried in HORSE]
         yield _noisy(f"{name}, the first {TRIALS}", data, noise, slow, few)
 
 
@@ -77,19 +77,20 @@ def _noisy(
         name=name,
         data=data,
         methods=methods,
-        trials=_arguments(trials),
+        trials=arguments(trials),
         judge=partial(judge_table, trials),
         x=noise,
         x_label="share of noise",
     )
 
 
-def _arguments(trials: Trials) -> list[tuple]:
+def arguments(trials: Trials) -> list[tuple]:
     """Of `solve`: the points and a seed."""
     return [(points, k) for k, points in enumerate(trials.source)]
 
 
-def _method(tried: Tried, trials: Trials) -> Method:
+def method_of(tried: Tried, trials: Trials) -> Method:
+    """Registers one trial after the other; `look_ups` is what it may look up."""
     d = trials.target.shape[1]
     init = np.eye(d + 1, dtype=np.float32) if tried.from_identity else None
     guess = "from the pose as given" if tried.from_identity else "no guess"
@@ -118,7 +119,7 @@ def published(noise: float) -> Method:
     """The paper's line of Table 1."""
     shift, angle = PUBLISHED[noise]
     text = "1,000 trials on its own horse"
-    metrics = [*_offsets("t", "units", *shift), *_offsets("theta", "deg", *angle)]
+    metrics = [*offsets("t", "units", *shift), *offsets("theta", "deg", *angle)]
     return Method("the paper's Table 1", "published", text, metrics=metrics)
 
 
@@ -149,8 +150,8 @@ def judge_table(trials: Trials, answers: list[Any]) -> Judged:
     return Judged(
         [
             share("success", right, 5.0),
-            *_offsets("t", "units", shift.mean(), shift.std(), shift.max()),
-            *_offsets("theta", "deg", theta.mean(), theta.std(), abs(theta).max()),
+            *offsets("t", "units", shift.mean(), shift.std(), shift.max()),
+            *offsets("theta", "deg", theta.mean(), theta.std(), abs(theta).max()),
             error("e_rot", float(np.median(found.degrees)), "deg", 0.02),
         ]
     )
@@ -163,8 +164,9 @@ def _about_z(T: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.rad2deg(np.arctan2(y, x))
 
 
-def _offsets(
+def offsets(
     of: str, unit: str, mean: float, deviation: float, most: float
 ) -> list[Metric]:
+    """Mean, deviation and largest size of an error, as in Table 1."""
     values = {"mean": mean, "dev": deviation, "max": most}
     return [Metric(f"{of}_{k}", float(v), unit, "down") for k, v in values.items()]

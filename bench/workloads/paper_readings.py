@@ -1,0 +1,12 @@
+"""What both papers leave open, varied one at a time: see `docs/pages/readings.md`."""
+
+from collections.abc import Iterator
+
+from bench.case import Case, Options
+from bench.workloads import readings_averaging, readings_filter
+
+
+def cases(options: Options) -> Iterator[Case]:
+    """Those of the particle filter, then those of motion averaging."""
+    yield from readings_filter.cases(options)
+    yield from readings_averaging.cases(options)
