@@ -39,7 +39,7 @@ from jaxreg.averaging import (
     average,
     starting_poses,
 )
-from jaxreg.averaging.measures import frobenius, length_scale, weighted_mean
+from jaxreg.averaging.measures import frobenius, weighted_mean
 from jaxreg.averaging.steps.iterate import averaging_step, iterate, solution_of
 from jaxreg.averaging.steps.kernel_width import gaussian_trust
 from jaxreg.averaging.steps.rows import RootRows
@@ -73,7 +73,7 @@ class Reading(AbstractAverager):
         self, graph: PoseGraph, init: Array | None, key: Array | None
     ) -> AveragingSolution:
         """Averages a prepared graph; no gradients."""
-        own = length_scale(graph)
+        own = graph.length_scale
         scale = jnp.where(jnp.asarray(self.unit) > 0, self.unit, own).astype(own.dtype)
         end = iterate(
             graph,
