@@ -56,7 +56,7 @@ def sandhu2010(
         num_points: source points that particles are measured on, the paper's all.
 
     Raises: ValueError for another d; when it is used, for points that are not of
-        dimension d.
+    dimension d.
 
     Fails: TOO_FEW_POINTS for fewer than d + 1 points, which do not tell a rotation.
     """
