@@ -7,6 +7,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.typing import Motion
 from jaxreg.linear.small import eigh
 from jaxreg.local.optimiser import LocalOptimiser
@@ -23,9 +24,10 @@ _PROBES = 256
 _LEAST_ANSWER = 0.01
 # Target points in a cell: about as many as a normal is estimated from.
 _CELL = 8
-# Poses around the answer, one deviation away along every axis, and balanced.
+# The answer, and poses around it, one deviation away along every axis, and balanced.
 _AROUND = np.array(
-    [[(-1) ** (row & col).bit_count() for col in range(1, 7)] for row in range(8)]
+    [[0] * 6]
+    + [[(-1) ** (row & col).bit_count() for col in range(1, 7)] for row in range(8)]
 )
 
 
@@ -84,18 +86,26 @@ def pose_covariance(
         A = answer(optimiser, problem, T, found, width, weight)
         return A, _scatter(optimiser, found, weight, cell)
 
-    def around(side: Array) -> tuple[Array, Array]:
-        T = turn_and_shift(T_target_source, full_matmul(root, side[:, None])[:, 0])
-        return parts(T, match(problem, T, width=width))
-
     def sandwich_of(A: Array, B: Array) -> Array:
         inverse = inverse_within(A, H)
         return full_matmul(inverse, full_matmul(B, inverse))
 
-    root = _root(sandwich_of(*parts(T_target_source, found)))
-    sides = jnp.asarray(_AROUND[:, : len(H)], H.dtype)
-    A, B = lax.map(around, sides)
-    return sandwich_of(jnp.mean(A, axis=0), jnp.mean(B, axis=0))
+    def at_side(number: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        root, A, B = state
+        T = turn_and_shift(T_target_source, full_matmul(root, sides[number])[:, 0])
+        here = parts(T, match(problem, T, width=width))
+        return control.cond(
+            number == 0,  # at the answer itself, which says how far around it lies
+            lambda: (_root(sandwich_of(*here)), A, B),
+            lambda: (root, A + here[0], B + here[1]),
+        )
+
+    sides = jnp.asarray(_AROUND[:, : len(H)], H.dtype)[..., None]
+    # One loop, so that searches are compiled once.
+    none = jnp.zeros_like(H)
+    _, A, B = control.fori_loop(0, len(sides), at_side, (none, none, none))
+    num = len(sides) - 1
+    return sandwich_of(A / num, B / num)
 
 
 def _cells(problem: Problem) -> Int[Array, " m"]:
