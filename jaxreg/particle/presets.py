@@ -17,9 +17,6 @@ from jaxreg.particle.resamplers import Systematic
 from jaxreg.robust import L2
 
 
-_DIFFUSION = StochasticDynamics(spread=MeasuredSpread())
-
-
 def sandhu2010(
     d: int,
     num_particles: int = 200,
@@ -60,6 +57,8 @@ def sandhu2010(
 
     Fails: TOO_FEW_POINTS for fewer than d + 1 points, which do not tell a rotation.
     """
+    if dynamics is None:  # not at import, as numbers become arrays on a device
+        dynamics = StochasticDynamics(spread=MeasuredSpread())
     if not isinstance(d, int | np.integer) or d not in (2, 3):
         raise ValueError(f"sandhu2010: d must be 2 or 3, found {shown(d)}.")
     check_count(num_particles, "sandhu2010: num_particles", 2)
@@ -74,7 +73,7 @@ def sandhu2010(
         num_agreeing=0,
         num_points=num_points,
         prior=GaussianPrior(0.5, 0.5) if prior is None else prior,
-        dynamics=_DIFFUSION if dynamics is None else dynamics,
+        dynamics=dynamics,
         resampler=Systematic(),
         energy=SquaredEnergy(),
         residual=PointToPoint(),
