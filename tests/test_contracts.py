@@ -15,6 +15,7 @@ import jaxreg as jr
 BASES = {
     "BriefModule": "gives a module its line for people, nothing else",
     "Options": "fields of all commands",
+    "KnownOptions": "fields of the commands that take what is known of the world",
     "SearchOptions": "fields of the commands that search",
     "ModelOptions": "fields of the commands that write scans in one frame",
 }
