@@ -18,3 +18,19 @@ print(*(name for name in {slow} if name in sys.modules))
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert told.stdout.split() == []
+
+
+def test_imports_start_no_backend():
+    code = """
+import importlib, pkgutil
+import jax
+import jaxreg
+for module in pkgutil.walk_packages(jaxreg.__path__, "jaxreg."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+print(len(jax._src.xla_bridge._backends))
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == ["0"]
