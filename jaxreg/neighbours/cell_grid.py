@@ -34,6 +34,8 @@ _UNROLL = 2
 _RESOLUTION = {2: 64, 3: 16}
 # Of about so many points the closest answers coarsely: 0.7 ms for 1,024 queries.
 _COARSE = 2048
+# Widths of cells that are tried.
+_WIDTHS = 32
 # Cells are this much wider than two radii, for the rounding of coordinates.
 _SLACK = 1.01
 
@@ -59,6 +61,7 @@ class CellGrid(AbstractIndex):
     ordered: Float[Array, "d m"]
     start: Int[Array, " cells"]
     origin: Float[Array, " d"]
+    size: Int[Array, " d"]
 
     @classmethod
     def build(
@@ -83,9 +86,9 @@ class CellGrid(AbstractIndex):
         if radius is None:
             radius = median_spacing(frozen, mask)
         radius = lax.stop_gradient(jnp.asarray(radius, points.dtype))
-        origin, width = _grid(frozen, mask, 2 * _SLACK * radius)
-        home = _cell_of(frozen.T, origin, width, _resolution(m, d))
         cells = _resolution(m, d) ** d
+        origin, width, size = _grid(frozen, mask, 2 * _SLACK * radius, cells)
+        home = _cell_of(frozen.T, origin, width, size)
         home = jnp.where(mask, home, cells)
         rows = rows_in_order(home, cells.bit_length())
         count = jnp.zeros(cells, jnp.int32).at[home].add(1, mode="drop")
@@ -93,7 +96,7 @@ class CellGrid(AbstractIndex):
         ordered = frozen[rows]
         table = VoxelTable.build(ordered, mask[rows], resolution=_RESOLUTION[d])
         radius = width / (2 * _SLACK)
-        return cls(points, mask, radius, table, rows, ordered.T, start, origin)
+        return cls(points, mask, radius, table, rows, ordered.T, start, origin, size)
 
     @property
     def reach(self) -> Scalar:
@@ -145,14 +148,14 @@ class CellGrid(AbstractIndex):
         self, queries: Float[Array, "d t"], axes: list[Float[Array, " m"]]
     ) -> Int[Array, " t"]:
         """Rows among the ordered points."""
-        (m, d), width = self.points.shape, 2 * _SLACK * self.radius
-        size = _resolution(m, d)
+        d, width = self.points.shape[1], 2 * _SLACK * self.radius
+        stride = jnp.cumprod(self.size)
         # The lower of the two cells along each axis.
         below = queries - width / 2
-        corner = _cell_of(below, self.origin, width, size, last=size - 2)
+        corner = _cell_of(below, self.origin, width, self.size, beside=1)
         first, last = [], []
         for steps in itertools.product((0, 1), repeat=d - 1):
-            offset = sum(s * size ** (axis + 1) for axis, s in enumerate(steps))
+            offset = sum(s * stride[axis] for axis, s in enumerate(steps))
             first.append(self.start[corner + offset])
             last.append(self.start[corner + offset + 2] - 1)
         longest = jnp.max(jnp.stack(last) - jnp.stack(first))
@@ -182,35 +185,51 @@ class CellGrid(AbstractIndex):
 
 
 def _resolution(num_points: int, d: int) -> int:
-    """Cells along each axis, about as wide as two spacings of a surface (a curve)."""
+    """Cells along each axis of a cube, as wide as two spacings of a surface (a curve).
+
+    As many cells in all serve boxes that are no cubes.
+    """
     if d == 2:
         return min(max(num_points // 4, 16), 512)
     return min(max(8 * -(-math.isqrt(num_points) // 16), 8), 128)
 
 
-def _grid(points: Array, mask: Array, width: Scalar) -> tuple[Array, Scalar]:
-    """Lowest corner and width of the cells, no less than asked.
+def _grid(
+    points: Array, mask: Array, width: Scalar, num_cells: int
+) -> tuple[Float[Array, " d"], Scalar, Int[Array, " d"]]:
+    """Lowest corner and width of the cells, no less than asked, and how many each way.
 
-    Points beyond the bulk's extent are in the cells of the border.
+    As narrow as `num_cells` of them allow: those of a street are flat. Points beyond
+    the bulk's extent are in the cells of the border.
     """
     m, d = points.shape
     low, high = bulk_extent(points, mask)
-    width = jnp.maximum(width, jnp.max(high - low) / (_resolution(m, d) - 1))
+    extent = jnp.nan_to_num(high - low, posinf=0, neginf=0)
+    widest = jnp.max(extent) / (_resolution(m, d) - 2)
+    width = jnp.maximum(width, 1e-6 * widest)
     width = jnp.where(width > 0, width, 1)  # not for NaN either, where none is valid
-    return jnp.nan_to_num(low - width / 4), width
+    widths = width * jnp.maximum(widest / width, 1) ** jnp.linspace(0, 1, _WIDTHS)
+    sizes = jnp.floor(extent / widths[:, None]) + 2
+    fits = jnp.prod(sizes, axis=1) <= num_cells
+    row = jnp.where(jnp.any(fits), jnp.argmax(fits), _WIDTHS - 1)
+    width = widths[row]
+    return jnp.nan_to_num(low - width / 4), width, sizes[row].astype(jnp.int32)
 
 
 def _cell_of(
     columns: Float[Array, "d n"],
     origin: Array,
     width: Scalar,
-    size: int,
-    last: int | None = None,
+    size: Int[Array, " d"],
+    beside: int = 0,
 ) -> Int[Array, " n"]:
-    """The cells of points, counted along the first axis first; the border's outside."""
-    flat = jnp.zeros(columns.shape[1:], jnp.int32)
+    """The cells of points, counted along the first axis first; the border's outside.
+
+    With `beside` more cells on its other side.
+    """
+    flat, stride = jnp.zeros(columns.shape[1:], jnp.int32), 1
     for axis in range(columns.shape[0]):
         at = (columns[axis] - origin[axis]) / width
-        at = jnp.clip(at, 0, size - 1 if last is None else last)
-        flat = flat + at.astype(jnp.int32) * size**axis
+        at = jnp.clip(at, 0, size[axis] - 1 - beside)
+        flat, stride = flat + at.astype(jnp.int32) * stride, stride * size[axis]
     return flat
