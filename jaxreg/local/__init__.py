@@ -8,6 +8,7 @@ from jaxreg.local.implicit import AbstractRest as AbstractRest
 from jaxreg.local.implicit import Rest as Rest
 from jaxreg.local.implicit import at_rest as at_rest
 from jaxreg.local.optimiser import LocalOptimiser as LocalOptimiser
+from jaxreg.local.settle import settled as settled
 from jaxreg.local.steps import AbstractStep as AbstractStep
 from jaxreg.local.steps import ClosedForm as ClosedForm
 from jaxreg.local.steps import GaussNewton as GaussNewton
