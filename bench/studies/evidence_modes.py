@@ -71,9 +71,8 @@ def padded(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, ...]:
 def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, ...]:
     """`(q,)` the numbers of poses `(q, 4, 4)`, as the evidence has them."""
     ready = prepare_pair(ParticleFilter(), tuple(map(jnp.asarray, clouds)))
-    pair = ready.source, ready.target
-    indexes = (BruteForce.build(cloud.points, cloud.mask) for cloud in pair)
-    witness = Prepared(*pair, *indexes).judged.exact.witness
+    index = BruteForce.build(ready.target.points, ready.target.mask)
+    witness = Prepared(ready.source, ready.target, index).judged.exact.witness
     (there, back), (own, other) = witness.problems, witness.spacings
 
     def of_pose(T: jax.Array) -> tuple[jax.Array, ...]:

@@ -67,8 +67,8 @@ def proposed(clouds: tuple[jax.Array, ...]) -> tuple[Agreed, Frames, jax.Array]:
     """Proposals in the frames of the search, and the rows of distinct ones."""
     method = METHODS[1]
     ready = prepare_pair(method, clouds)
-    indexes = method._indexes(ready.source, ready.target)
-    spacing = Pair(ready.source, ready.target, *indexes).spacing
+    index = method.index_of(ready.target)
+    spacing = Pair(ready.source, ready.target, index).spacing
     agreed = propose(ready.source, ready.target, spacing)
     T = agreed.T_target_source
     particles = Particles.at(T, len(T)).valued(-agreed.num_agreeing.astype(T.dtype))

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from jaxreg.cloud import PointCloud, centroid, rms_radius
 from jaxreg.geometry import lie
 from jaxreg.matching import PointToPoint
-from jaxreg.neighbours import AbstractIndex, BruteForce, VoxelTable
+from jaxreg.neighbours import AbstractIndex, VoxelTable
 from jaxreg.particle import (
     AbsoluteEnergy,
     AbstractSearch,
@@ -84,10 +84,7 @@ def search(method: AbstractSearch, model: Model, sources: Array, key: Array) -> 
         centre = centroid(points, mask)
         points = (points - centre) / model.radius
         cloud = PointCloud(points, jnp.zeros_like(points), mask)
-        index = BruteForce.build(points, mask)
-        found = method.solve_indexed(
-            cloud, model.cloud, index, model.closest, None, key
-        )
+        found = method.solve_indexed(cloud, model.cloud, model.closest, None, key)
         R = lie.rotation(found.T_target_source)
         t = lie.translation(found.T_target_source)
         t = model.radius * t + model.centre - R @ centre

@@ -82,6 +82,4 @@ def _prepare(
 
 @eqx.filter_jit
 def _search(method: AbstractSearch, source: Prepared, target: Prepared, key: jax.Array):
-    return method.solve_indexed(
-        source.cloud, target.cloud, source.table, target.table, None, key
-    )
+    return method.solve_indexed(source.cloud, target.cloud, target.table, None, key)

@@ -48,12 +48,12 @@ def index_of(method: AbstractRegistrar, cloud: PointCloud) -> AbstractIndex:
 def solve(
     method: AbstractRegistrar,
     clouds: tuple[PointCloud, PointCloud],
-    indexes: tuple[AbstractIndex, AbstractIndex],
+    target_index: AbstractIndex,
     key: Key,
 ) -> RegistrationSolution:
     """Registers the first of two prepared scans to the second, in their frames."""
     if isinstance(method, AbstractIndexedRegistrar):
-        return method.solve_indexed(*clouds, *indexes, None, key)
+        return method.solve_indexed(*clouds, target_index, None, key)
     return method.solve(*clouds, None, key)
 
 

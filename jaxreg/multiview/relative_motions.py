@@ -182,7 +182,7 @@ def relative_motions(
         solution = solve(
             scans.method_of(method, i, j),
             (scans.cloud(j), scans.cloud(i)),
-            (scans.table(j), scans.table(i)),
+            scans.table(i),
             jax.random.fold_in(jax.random.fold_in(key, i), j),
         )
         modes = jax.tree.map(lambda x: x[: num_kept(method)], solution.modes)

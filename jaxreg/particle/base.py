@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.arrays import cast_floats, on_both
+from jaxreg._core.arrays import cast_floats
 from jaxreg._core.checks import (
     check_counts,
     check_key,
@@ -20,12 +20,11 @@ from jaxreg._core.checks import (
     check_positive,
 )
 from jaxreg._core.typing import Key, Mask, Motion, Points
-from jaxreg.cloud import PointCloud, levelled, thin, without_noise
+from jaxreg.cloud import PointCloud, thin, without_noise
 from jaxreg.local import AbstractStep, LocalOptimiser
 from jaxreg.matching import AbstractResidual, Problem
 from jaxreg.neighbours import (
     AbstractIndex,
-    BruteForce,
     IndexBuilder,
     VoxelTable,
     check_index,
@@ -51,8 +50,6 @@ from jaxreg.registrar import (
 from jaxreg.robust import AbstractKernel
 
 
-# Source points that only the scores look up by comparing all pairs.
-_FEW = 600
 # The agreement of normals decides what is trusted: the careful estimate.
 _NORMAL_NEIGHBOURS = 10
 # As many times more points tell the last digits. (Median errors of eleven lidar pairs
@@ -153,7 +150,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
     def problem(self, pair: tuple[Array, ...], key: Key) -> Problem:
         """What `search` works on, of a source, a target and their masks; traced."""
         ready = prepare_pair(self, pair)
-        index = self._indexes(ready.source, ready.target)[1]
+        index = self.index_of(ready.target)
         problem = Problem.of(ready.source, ready.target, index, ready.frames)
         return _some_points(check_key(key), problem, self.num_points)
 
@@ -166,19 +163,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
     ) -> RegistrationSolution:
         """Searches, refines and scores in the prepared frames."""
         key = check_key(key)
-        indexes = self._indexes(source, target)
-        return self.solve_indexed(source, target, *indexes, init, key)
-
-    def _indexes(
-        self, source: PointCloud, target: PointCloud
-    ) -> tuple[AbstractIndex, AbstractIndex]:
-        """Of source and target."""
-        if self.index is not None:
-            return on_both(self.index_of, *levelled(source, target))
-        if len(source.mask) <= _FEW:  # compared in less time than a table is filled in
-            source_index = BruteForce.build(source.points, source.mask)
-            return source_index, VoxelTable.build(target.points, target.mask)
-        return on_both(self.index_of, *levelled(source, target))
+        return self.solve_indexed(source, target, self.index_of(target), init, key)
 
     def index_of(self, cloud: PointCloud) -> AbstractIndex:
         """Of the kind asked for; a voxel table if none is."""
@@ -189,16 +174,15 @@ class AbstractSearch(AbstractIndexedRegistrar):
         self,
         source: PointCloud,
         target: PointCloud,
-        source_index: AbstractIndex,
         target_index: AbstractIndex,
         init: Motion | None,
         key: Key | None,
     ) -> RegistrationSolution:
-        """`solve` with indexes built before, for clouds that enter many pairs."""
+        """`solve` with an index built before, for clouds that enter many pairs."""
         # The search is not differentiated, its loops know no reverse mode; the answer
         # is, by what its last steps depend on.
         moving = cast_floats(self, source.points.dtype)
-        moving_pair = Pair(source, target, source_index, target_index)
+        moving_pair = Pair(source, target, target_index)
         self, pair, init = lax.stop_gradient((moving, moving_pair, init))
         key_points, key_search = jax.random.split(check_key(key))
         few = _some_points(key_points, pair.problem, self.num_points)

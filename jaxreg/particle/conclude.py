@@ -17,7 +17,7 @@ from jaxreg.local import Curvature, Rest, at_rest
 from jaxreg.matching import NO_EVIDENCE, Evidence, Problem
 from jaxreg.particle.last_digits import LastRest, last_digits
 from jaxreg.particle.modes import distinct_modes, first_within
-from jaxreg.particle.pair import Pair
+from jaxreg.particle.pair import ExactPair, Pair
 from jaxreg.particle.refine import followed, polished, polishing, refined
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import Modes, RegistrationSolution
@@ -157,7 +157,7 @@ def _candidates(
 
 def _judged(
     pair: Pair,
-    exact: Pair,
+    exact: ExactPair,
     kernel: AbstractKernel,
     candidates: tuple[Float[Array, "q D D"], Float[Array, " q"]],
     num_modes: int,
@@ -194,7 +194,7 @@ def _judged(
 
 def _accurate(
     pair: Pair,
-    exact: Pair,
+    exact: ExactPair,
     kernel: AbstractKernel,
     found: _Candidates,
     enough: Bool[Array, ""],
@@ -204,12 +204,15 @@ def _accurate(
     log_evidence, sound = found.log_evidence, found.sound
     hopeful = log_evidence > log_evidence[0] - _HOPELESS
     width, steps = 0.5 * pair.spacing, _POLISH if refines else 0
-    every = polished(exact.problem, kernel, found.T, sound, hopeful, width, steps)
+    how = exact.problem, kernel, found.T
     if not steps or pair.source.fine is None:
-        return every
+        return polished(*how, sound, hopeful, width, steps)
+    closer = sound[0] & enough
+    others = sound.at[0].set(sound[0] & ~closer)
+    every = polished(*how, others, hopeful, width, steps)
     first = jax.tree.map(lambda x: x[0], every)
     last = control.cond(
-        sound[0] & enough,
+        closer,
         lambda first: last_digits(pair, kernel, first[0], width),
         lambda first: first,
         first,
@@ -220,7 +223,7 @@ def _accurate(
 def _followed(
     pair: Pair,
     kernel: AbstractKernel,
-    exact: Pair,
+    exact: ExactPair,
     T: Float[Array, "q D D"],
     sound: Bool[Array, " q"],
     enough: Bool[Array, ""],

@@ -1,4 +1,4 @@
-"""`Pair`: two prepared clouds that can find each other's points."""
+"""`Pair`: two prepared clouds, of which one finds the other's points, or both."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,11 +11,10 @@ from jaxreg.neighbours import AbstractIndex, index_within
 
 
 class Pair(eqx.Module):
-    """Two prepared clouds with their indexes."""
+    """Two prepared clouds and the index of the target."""
 
     source: PointCloud
     target: PointCloud
-    source_index: AbstractIndex
     target_index: AbstractIndex
 
     @property
@@ -24,22 +23,15 @@ class Pair(eqx.Module):
         return Problem.of(self.source, self.target, self.target_index)
 
     @property
-    def exact(self) -> "Pair":
+    def exact(self) -> "ExactPair":
         """With indexes that miss no near point; tables miss every other."""
-        indexes = on_both(
+        source_index, target_index = on_both(
             lambda cloud: index_within(
                 cloud.points, cloud.mask, median_spacing(cloud.points, cloud.mask)
             ),
             *levelled(self.source, self.target),
         )
-        return Pair(self.source, self.target, *indexes)
-
-    @property
-    def fine(self) -> "Pair":
-        """With the most points there are, and such indexes."""
-        source, target = levelled(self.source.finest, self.target.finest)
-        pair = Pair(source, target, self.source_index, self.target_index)
-        return pair.exact
+        return ExactPair(self.source, self.target, target_index, source_index)
 
     @property
     def judged(self) -> "Pair":
@@ -47,13 +39,7 @@ class Pair(eqx.Module):
         if self.source.judged is None and self.target.judged is None:
             return self
         clouds = levelled(self.source.as_judged, self.target.as_judged)
-        return Pair(*clouds, self.source_index, self.target_index)
-
-    @property
-    def witness(self) -> Witness:
-        """Who tells how likely poses are."""
-        clouds = self.source, self.target
-        return Witness.of(*clouds, self.source_index, self.target_index)
+        return Pair(*clouds, self.target_index)
 
     @property
     def spacing(self) -> Scalar:
@@ -64,3 +50,15 @@ class Pair(eqx.Module):
                 *levelled(self.source, self.target),
             )
         )
+
+
+class ExactPair(Pair):
+    """Two clouds with indexes that miss no near point, in either direction."""
+
+    source_index: AbstractIndex
+
+    @property
+    def witness(self) -> Witness:
+        """Who tells how likely poses are."""
+        clouds = self.source, self.target
+        return Witness.of(*clouds, self.source_index, self.target_index)

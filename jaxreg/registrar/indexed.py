@@ -12,7 +12,7 @@ from jaxreg.registrar.base import AbstractRegistrar, RegistrationSolution
 
 
 class AbstractIndexedRegistrar(AbstractRegistrar):
-    """A registrar that takes indexes built before, and knows several answers.
+    """A registrar that takes an index built before, and knows several answers.
 
     `reconstruct` takes any registrar. Of this kind it builds the index of each scan
     once, keeps the best of the modes of each pair, believes by its `min_log_evidence`;
@@ -35,9 +35,8 @@ class AbstractIndexedRegistrar(AbstractRegistrar):
         self,
         source: PointCloud,
         target: PointCloud,
-        source_index: AbstractIndex,
         target_index: AbstractIndex,
         init: Motion | None,
         key: Key | None,
     ) -> RegistrationSolution:
-        """`solve` with the indexes of both clouds."""
+        """`solve` with the index of the target."""

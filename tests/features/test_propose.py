@@ -123,5 +123,4 @@ def test_in_the_plane_there_are_none():
 
 
 def _pair(source: PointCloud, target: PointCloud) -> Pair:
-    indexes = (BruteForce.build(x.points, x.mask) for x in (source, target))
-    return Pair(source, target, *indexes)
+    return Pair(source, target, BruteForce.build(target.points, target.mask))

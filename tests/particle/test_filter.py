@@ -65,8 +65,7 @@ def _pair(d: int, T: np.ndarray | None = None) -> Pair:
     T = np.eye(d + 1) if T is None else T
     points = blob(2 * N, d) - blob(2 * N, d).mean(0)
     source, target = _cloud(move(np.linalg.inv(T), points[:N])), _cloud(points)
-    indexes = BruteForce.build(source.points), BruteForce.build(target.points)
-    return Pair(source, target, *indexes)
+    return Pair(source, target, BruteForce.build(target.points))
 
 
 @eqx.filter_jit
@@ -374,7 +373,7 @@ def test_parts_go_together_and_keep_the_dtype(method):
 
 
 def _parts(pair: Pair):
-    return pair.source, pair.target, pair.source_index, pair.target_index
+    return pair.source, pair.target, pair.target_index
 
 
 def _lump(n: int, kind: int, seed: int) -> np.ndarray:
