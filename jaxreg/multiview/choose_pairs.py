@@ -19,22 +19,22 @@ from scipy.sparse.csgraph import shortest_path
 
 Order = Literal["any", "sequential"]
 
-# Up to so many scans all pairs are registered; of more, so many pairs a scan.
-_ALL_UP_TO, _PAIRS_PER_SCAN = 20, 10
+#: Up to so many scans all pairs are registered; of more, so many pairs a scan.
+ALL_UP_TO, _PAIRS_PER_SCAN = 20, 10
 # Partners of each scan in a first round, in the given order and in a random one.
 _IN_ORDER, _AT_RANDOM = 2, 3
 # Tries of a part that is not joined, a scan and round.
 _TRIES = 3
 # A scan is safe by so many trusted pairs; a loop has so many pairs or more.
 _SAFE, _LOOP = 3, 4
-# Scans are taken to overlap by the poses from this share on.
-_LIKELY = 0.2
+#: Scans are taken to overlap by the poses from this share on.
+LIKELY = 0.2
 
 
 def most_pairs(num_scans: int) -> int:
     """Pairs registered at most: all of up to 20 scans, ten times V of more."""
     every = num_scans * (num_scans - 1) // 2
-    return every if num_scans <= _ALL_UP_TO else min(every, _PAIRS_PER_SCAN * num_scans)
+    return every if num_scans <= ALL_UP_TO else min(every, _PAIRS_PER_SCAN * num_scans)
 
 
 def all_pairs(num_scans: int) -> np.ndarray:
@@ -51,7 +51,7 @@ def first_pairs(num_scans: int, order: Order, rng: np.random.Generator) -> np.nd
             far as there are many; "any": those and pairs at random.
         rng: of the caller.
     """
-    if num_scans <= _ALL_UP_TO and order == "any":
+    if num_scans <= ALL_UP_TO and order == "any":
         return all_pairs(num_scans)
     chosen = np.zeros((num_scans, num_scans), bool)
     for step in range(1, _IN_ORDER + 1):
@@ -86,7 +86,7 @@ def next_pairs(
     for i in np.flatnonzero(part != largest):
         others = np.flatnonzero(open_[i] & (part != part[i]))
         chosen[i, rng.permutation(others)[:_TRIES]] = True
-    overlap = np.where(open_ & (likely >= _LIKELY), likely, 0)
+    overlap = np.where(open_ & (likely >= LIKELY), likely, 0)
     hops = shortest_path(trusted, unweighted=True)
     loop = np.where(hops >= _LOOP, overlap * np.minimum(hops, num), 0)
     weak = np.sum(trusted, axis=1) < _SAFE

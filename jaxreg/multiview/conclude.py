@@ -16,6 +16,7 @@ from jaxreg.multiview.find_turnable import turnable
 from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.known_world import KnownWorld
 from jaxreg.multiview.method import min_log_evidence
+from jaxreg.multiview.near_pairs import near_pairs
 from jaxreg.multiview.pair_trust import pair_trust
 from jaxreg.multiview.place import Placement, place, prior_weight
 from jaxreg.multiview.prepare import PreparedScans
@@ -51,16 +52,16 @@ def finish(
     least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
     placement = place(motions, scans.num_scans, averaging, least)
     mode, turns = placement.mode, turnable(motions, placement)
-    placement, measured = refine(moving, placement, averaging, least - _VOUCHED)
+    pairs, likely = near_pairs(scans, placement, motions), least - _VOUCHED
+    placement, measured = refine(moving, placement, averaging, likely, pairs)
     if hold is not None:
-        placement = hold.place(scans, placement, averaging, least - _VOUCHED)
-        free = (turns | slipping(scans, placement, least)) & ~hold.held
+        placement = hold.place(scans, placement, averaging, likely, pairs)
+        free = (turns | slipping(scans, placement, least, pairs)) & ~hold.held
         solution = _solution(scans, motions, mode, placement, free, least)
         return hold.in_world(solution)
-    free = turns | slipping(scans, placement, least)
+    free = turns | slipping(scans, placement, least, pairs)
     if known is None:
         return _solution(moving, motions, mode, placement, free, least)
-    likely = least - _VOUCHED
     placement, trust = known.place(scans, placement, measured, averaging, likely)
     free = free & ~known.fixed
     solution = _solution(moving, motions, mode, placement, free, least)

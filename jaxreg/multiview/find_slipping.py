@@ -22,7 +22,7 @@ from jaxreg.multiview.prepare import PreparedScans
 
 @kept_program
 def slipping(
-    scans: PreparedScans, placement: Placement, least: Scalar
+    scans: PreparedScans, placement: Placement, least: Scalar, pairs: Int[Array, "p 2"]
 ) -> Bool[Array, " v"]:
     """`(v,)` scans that can move along the main body of their part.
 
@@ -30,8 +30,8 @@ def slipping(
         scans: prepared scans.
         placement: their final poses.
         least: log evidence of the pairs that count.
+        pairs: those that may overlap (`near_pairs`).
     """
-    pairs = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
     body = _bodies(pairs, _grips(scans, placement, pairs, least), scans.num_scans)
     return ~in_main_body(body, placement.part)
 
@@ -50,7 +50,7 @@ def _grips(
         T_i_j = lie.between(T_world_i[i], T_world_i[j])
         witness = scans.witness(i, j)
         found = witness.of_pose(T_i_j)
-        use = (found.log_evidence >= least) & placement.together(i, j)
+        use = (found.log_evidence >= least) & placement.together(i, j) & (i != j)
         grip = jax.tree.map(lambda x: jnp.where(use, x, 0), found.grip)
         return grip.seen_from(T_world_i[i])
 

@@ -53,6 +53,7 @@ class Held(eqx.Module):
         found: Placement,
         averaging: AbstractAverager | None,
         least: Scalar,
+        pairs: Int[Array, "p 2"],
     ) -> Placement:
         """The others beside those that stay.
 
@@ -61,9 +62,10 @@ class Held(eqx.Module):
             found: where all of them lie, none held.
             averaging: as in `place`.
             least: log evidence of the pairs that count.
+            pairs: those that may overlap (`near_pairs`).
         """
         before = _brought(self, scans, found)
-        motions = measured(scans, before, least, exact=True)
+        motions = measured(scans, before, least, pairs, exact=True)
         num_nodes = 1 + int(np.max(np.asarray(self.node)))
         motions = _contracted(self, before, motions)
         nodes = place(motions, num_nodes, wide_unless_given(averaging), least)

@@ -9,9 +9,10 @@ are not noise but warps, which the median of many pairs evens out.)
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxreg._core import control
 from jaxreg._core.arrays import cast_floats
@@ -20,7 +21,7 @@ from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
-from jaxreg.matching import NO_EVIDENCE, PlaneToPlane, Problem
+from jaxreg.matching import NO_EVIDENCE, Evidence, PlaneToPlane, Problem
 from jaxreg.multiview.follow_points import follow_points
 from jaxreg.multiview.place import Placement, part_sizes, place
 from jaxreg.multiview.prepare import PreparedScans
@@ -41,6 +42,7 @@ def refine(
     placement: Placement,
     averaging: AbstractAverager | None,
     least: Scalar,
+    pairs: Int[Array, "p 2"],
 ) -> tuple[Placement, RelativeMotions]:
     """Poses from all pairs of placed scans that overlap, measured anew.
 
@@ -52,6 +54,7 @@ def refine(
         placement: poses of the centred frames, and which scans hang together.
         averaging: None for `MCC`.
         least: log evidence of the pairs that count.
+        pairs: those that may overlap (`near_pairs`).
 
     Returns:
         The placement by these pairs, and the pairs. Scans that no pair holds any more
@@ -64,8 +67,8 @@ def refine(
         again = place(motions, scans.num_scans, averaging, least)
         return _updated(placement, again)
 
-    placement = averaged(measured(scans, placement, least, exact=False))
-    motions = measured(scans, placement, least, exact=True)
+    placement = averaged(measured(scans, placement, least, pairs, exact=False))
+    motions = measured(scans, placement, least, pairs, exact=True)
     optimiser, width = optimiser_of(motions.T_i_j), widths_of(moving, placement)[-1]
     motions = follow_points(moving, motions, optimiser, width, least)
     return averaged(motions), motions
@@ -100,12 +103,17 @@ def _updated(before: Placement, after: Placement) -> Placement:
 
 @kept_program
 def measured(
-    scans: PreparedScans, placement: Placement, least: Scalar, *, exact: bool
+    scans: PreparedScans,
+    placement: Placement,
+    least: Scalar,
+    pairs: Int[Array, "p 2"],
+    *,
+    exact: bool,
 ) -> RelativeMotions:
-    """The motion and overlap of every pair of a part near the present poses, m = 1."""
+    """The motion and overlap of pairs of a part near the present poses, m = 1."""
     T_world_i = placement.T_world_i
     widths = widths_of(scans, placement, exact=exact)
-    optimiser = optimiser_of(T_world_i)
+    optimiser, zero = optimiser_of(T_world_i), jnp.zeros((), T_world_i.dtype)
 
     def measured(pair: Array) -> Motion:
         i, j = pair
@@ -116,15 +124,19 @@ def measured(
     def one(pair: Array) -> RelativeMotions:
         i, j = pair
         T_i_j = lie.between(T_world_i[i], T_world_i[j])
-        found, together = scans.witness(i, j).of_pose(T_i_j), placement.together(i, j)
-        told = jnp.where(together, found.log_evidence, NO_EVIDENCE)
-        T_i_j = control.cond(told >= least, measured, lambda _: T_i_j, pair)
-        return RelativeMotions(
-            pair, T_i_j[None], found.overlap[None], told[None], found.inlier_rmse[None]
+        overlap, told, rmse = control.cond(
+            placement.together(i, j) & (i != j),
+            lambda: _told(scans.witness(i, j).of_pose(T_i_j)),
+            lambda: (zero, zero + NO_EVIDENCE, zero),
         )
+        T_i_j = control.cond(told >= least, measured, lambda _: T_i_j, pair)
+        return RelativeMotions(pair, T_i_j[None], overlap[None], told[None], rmse[None])
 
-    pairs = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
     return lax.map(one, pairs)
+
+
+def _told(found: Evidence) -> tuple[Scalar, Scalar, Scalar]:
+    return found.overlap, found.log_evidence, found.inlier_rmse
 
 
 def optimiser_of(like: Array) -> LocalOptimiser:
@@ -152,5 +164,7 @@ def problem_of(
     source, target = scans.cloud(j), scans.cloud(i)
     if not exact:
         return Problem.of(source, target, scans.table(i))
+    if target.judged is None:  # whose index is that of the evidence
+        return Problem.of(source, target, jax.tree.map(lambda x: x[i], scans.exact))
     kind = exact_index(target.points.shape[0])
     return Problem.of(source, target, kind.build(target.points, target.mask))

@@ -5,19 +5,21 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
-from jaxreg._core import control
 from jaxreg._core.programs import kept_program
-from jaxreg._core.typing import Key, Progress, Scalar
+from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.threads import map_in_threads
 from jaxreg.geometry import lie
-from jaxreg.matching import Match, Problem, match
 from jaxreg.multiview.choose_pairs import Order, first_pairs, most_pairs, next_pairs
-from jaxreg.multiview.follow_sequence import SURE, descended_in_input_frames
+from jaxreg.multiview.follow_sequence import (
+    SURE,
+    descended,
+    descended_in_input_frames,
+)
 from jaxreg.multiview.method import min_log_evidence, num_kept
+from jaxreg.multiview.near_pairs import likely_overlap
 from jaxreg.multiview.place import Placement, joins, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
@@ -28,9 +30,6 @@ from jaxreg.registrar import AbstractRegistrar
 OnPairs = Callable[[RelativeMotions], None]
 
 _PAIRS_PER_BATCH, _THREADS = 4, 2
-# Poses of a chain drift: points this many spacings apart, one spacing over or under the
-# other's plane, may still be of one place.
-_DRIFT = 6.0
 
 
 class Rounds:
@@ -64,6 +63,7 @@ class Rounds:
             self.row = {pair: row for row, pair in enumerate(ids)}
         self.tried = np.zeros((scans.num_scans,) * 2, bool)
         self.found: list[RelativeMotions] = []
+        self.sure: dict[tuple[int, int], RelativeMotions] = {}
         self.rivals: dict[tuple[int, int], RelativeMotions] = {}
         self.most = most_pairs(scans.num_scans)
 
@@ -85,8 +85,12 @@ class Rounds:
             self._register(pairs)
             if self.num_tried >= self.most:
                 break
-            pairs = next_pairs(self.tried, *self._evidence(), rng)
+            placement, trusted, likely = self._evidence()
+            part = np.asarray(placement.part)
+            pairs = next_pairs(self.tried, trusted, likely, part, rng)
             pairs = pairs[: self.most - self.num_tried]
+            if order == "sequential":
+                self._close_loops(pairs, placement)
         return RelativeMotions.joined(self.found)
 
     @property
@@ -98,11 +102,12 @@ class Rounds:
         """The pairs in batches of one compiled size, two batches at a time."""
         self.tried[pairs[:, 0], pairs[:, 1]] = True
         self.tried |= self.tried.T
-        rows = [self.row.get(tuple(pair)) for pair in pairs.tolist()]
-        have = np.array([row for row in rows if row is not None], int)
-        if self.known is not None and len(have):
+        ids = list(map(tuple, pairs.tolist()))
+        have = [self.row[pair] for pair in ids if pair in self.row]
+        if self.known is not None and have:
             self.found.append(self.known.rows(jnp.asarray(have)))
-        pairs = pairs[[row is None for row in rows]]
+        self.found += [self.sure[pair] for pair in ids if pair in self.sure]
+        pairs = pairs[[not self._is_known(pair) for pair in ids]]
         total = self.num_tried
         done = total - len(pairs)
         self.report("registering pairs", done, total)
@@ -137,7 +142,6 @@ class Rounds:
         """
         scans, step = self.scans, np.eye(self.scans.mean.shape[1] + 1)
         sure: dict[tuple[int, int], np.ndarray] = {}
-        found = [] if self.known is None else [self.known]
         gaps = [(k, k + gap) for gap in (1, 2) for k in range(scans.num_scans - gap)]
         for done, (i, j) in enumerate(gaps):
             self.report("following the sequence", done, len(gaps))
@@ -147,28 +151,50 @@ class Rounds:
             if guess is None:
                 continue
             one = descended_in_input_frames(self.method, scans, (i, j), guess)
-            if float(one.log_evidence[0, 0]) < SURE:
-                self.rivals[i, j] = one
-                continue
             # Known pairs are followed, too: a run taken up again goes the same way.
-            if (i, j) not in self.row:
-                self._tell(one)
-                self.row[i, j] = sum(len(x.overlap) for x in found)
-                found.append(one.with_modes(num_kept(self.method)))
-            step = sure[i, j] = np.asarray(one.in_input_frames(scans).T_i_j[0, 0])
+            if self._keep(one, SURE):
+                step = sure[i, j] = np.asarray(one.in_input_frames(scans).T_i_j[0, 0])
         self.report("following the sequence", len(gaps), len(gaps))
-        if found:
-            self.known = jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
-    def _evidence(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Trusted pairs, likely overlap and parts, see `next_pairs`."""
+    def _close_loops(self, pairs: np.ndarray, placement: Placement) -> None:
+        """Pairs of a sequence by descents from the present poses.
+
+        Where these poses are wrong, what they bring together is no surface twice. A
+        descent is one try, where a search has hundreds: it is believed as an answer is.
+        """
+        part = np.asarray(placement.part)
+        T = placement.T_world_i
+        for done, (i, j) in enumerate(pairs.tolist()):
+            if part[i] != part[j] or self._is_known((i, j)):
+                continue
+            self.report("closing loops", done, len(pairs))
+            pair, T_i_j = jnp.array([(i, j)], jnp.int32), lie.between(T[i], T[j])
+            one = descended(self.method, self.scans, pair, T_i_j[None])
+            self._keep(one, float(min_log_evidence(self.method)))
+
+    def _is_known(self, pair: tuple[int, int]) -> bool:
+        return pair in self.row or pair in self.sure
+
+    def _keep(self, one: RelativeMotions, least: float) -> bool:
+        """Whether a motion is sure enough to be kept; if not it rivals the search's."""
+        i, j = one.pairs[0].tolist()
+        if float(one.log_evidence[0, 0]) < least:
+            self.rivals[i, j] = one
+            return False
+        if not self._is_known((i, j)):
+            self._tell(one)
+            self.sure[i, j] = one.with_modes(num_kept(self.method))
+        return True
+
+    def _evidence(self) -> tuple[Placement, np.ndarray, np.ndarray]:
+        """Present poses, and by them the trusted pairs and likely overlap."""
         motions = RelativeMotions.joined(self.found).padded(self.most)
         placement, likely = _prospects(self.method, self.averaging, self.scans, motions)
         trusted = np.zeros_like(self.tried)
         i, j = np.asarray(motions.pairs).T
         trusted[i, j] = np.asarray(joins(placement.edge_weight)) & (i != j)
         likely = np.asarray(likely)
-        return trusted | trusted.T, likely + likely.T, np.asarray(placement.part)
+        return placement, trusted | trusted.T, likely + likely.T
 
 
 @kept_program
@@ -181,27 +207,4 @@ def _prospects(
     """Present poses, and the share of scan j that is near scan i by them, i < j."""
     least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
     found = place(motions, scans.num_scans, averaging, least)
-    T = found.T_world_i
-
-    def share(pair: Array) -> Array:
-        i, j = pair
-        T_i_j = lie.between(T[i], T[j])
-        problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
-        return control.cond(
-            found.together(i, j),
-            lambda: _near(match(problem, T_i_j), scans.coarsest),
-            lambda: jnp.zeros_like(scans.coarsest),
-        )
-
-    i, j = jnp.triu_indices(scans.num_scans, 1)
-    shares = lax.map(share, jnp.stack([i, j], axis=1))
-    return found, jnp.zeros((scans.num_scans,) * 2, T.dtype).at[i, j].set(shares)
-
-
-def _near(found: Match, spacing: Scalar) -> Scalar:
-    """The share of the points that may be of the other surface."""
-    flat = jnp.any(found.normal != 0, axis=0)
-    near = (found.sq_residual < (_DRIFT * spacing) ** 2) & found.mask
-    near = near & (~flat | (jnp.abs(found.plane_residual) < spacing))
-    share = jnp.sum(near) / jnp.maximum(jnp.sum(found.mask), 1)
-    return share.astype(spacing.dtype)
+    return found, likely_overlap(scans, found)

