@@ -8,6 +8,7 @@ PEERS = {
     "open3d": "open3d",
     "small_gicp": "small_gicp",
     "gtsam": "gtsam",
+    "kiss-icp": "kiss_icp",
     "kiss-matcher": "kiss_matcher",
     "probreg": "probreg",
     "pycpd": "pycpd",

@@ -98,11 +98,44 @@ def street_pair(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return source.astype(np.float32), clouds[0].astype(np.float32), T
 
 
+def street_drive(seed: int, num_frames: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Scans along a street, round, and back on its other side; their `T_world_i`.
+
+    Scans are `(n, 3)` float32 of 32 rings, 1.2 m apart; nothing moves while one is
+    taken.
+    """
+    rng = np.random.default_rng(seed)
+    street, rays = Street.drawn(rng), _rays(-24, 6, 32, 900)
+    half, scans, poses = num_frames // 2, [], []
+    for k in range(num_frames):
+        there = min(k, 2 * half - k)
+        turned = np.clip((k - half + 6) / 12, 0, 1)  # within twelve frames
+        angles = (
+            np.pi * turned + 0.05 * np.sin(k / 5),
+            0.01 * np.sin(k / 3),
+            0.01 * np.cos(k / 4),
+        )
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("zyx", angles).as_matrix()
+        T[:3, 3] = 1.2 * there - 30, 2.4 * turned - 1.2, _EYE
+        r = street.ranges(T[:3, 3], rays @ T[:3, :3].T, rng)
+        seen = (r > _NEAREST) & (r < _FARTHEST) & (rng.random(len(r)) < 0.97)
+        r = r[seen] + rng.normal(0, 0.02, seen.sum())
+        scans.append((rays[seen] * r[:, None]).astype(np.float32))
+        poses.append(T)
+    return scans, np.stack(poses)
+
+
 def _scanner(rng: np.random.Generator) -> np.ndarray:
     """Unit rays `(n, 3)` of rings that spin."""
     top = np.radians(rng.uniform(2, 15))
-    up = np.linspace(np.radians(-24), top, rng.choice([16, 32, 64]))
-    around = np.linspace(0, 2 * np.pi, rng.choice([500, 900]), endpoint=False)
+    return _rays(-24, np.degrees(top), rng.choice([16, 32, 64]), rng.choice([500, 900]))
+
+
+def _rays(bottom: float, top: float, rings: int, a_turn: int) -> np.ndarray:
+    """Unit rays `(n, 3)`; the lowest and the highest ring in degrees."""
+    up = np.linspace(np.radians(bottom), np.radians(top), rings)
+    around = np.linspace(0, 2 * np.pi, a_turn, endpoint=False)
     up, around = (x.ravel() for x in np.meshgrid(up, around))
     flat = np.cos(up)
     return np.stack([flat * np.cos(around), flat * np.sin(around), np.sin(up)], 1)

@@ -1,4 +1,4 @@
-"""Sequences of other people's lidars into one frame, without a guess."""
+"""Sequences of other people's lidars into one frame, without a guess, and a drive."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -9,7 +9,9 @@ import numpy as np
 
 from bench.case import Case, Judged, Method, Options
 from bench.peers.multiview import Multiway
+from bench.peers.odometry import VOXEL, kiss_odometry
 from bench.records import Metric, error
+from bench.studies.streets import street_drive
 from bench.workloads.multiview import PEER, peer_method
 from bench.workloads.sensor_data import Sequence, pose_errors, sequences
 from jaxreg import reconstruct
@@ -18,12 +20,15 @@ from jaxreg.metrics import rotation_error, translation_error
 
 # A scan so far from where it belongs, in degrees and metres, is wrong.
 _WRONG = 5.0, 0.6
+# Frames of the generated drive.
+_FRAMES = 60
+_ODOMETRY = "KISS-ICP"
 #: Number of the connected group of each scan, negative of none; and poses.
 Placed = tuple[np.ndarray, np.ndarray]
 
 
 def cases(options: Options) -> Iterator[Case]:
-    """A case per sequence."""
+    """A case per sequence, and a drive along a generated street and back."""
     for data in sequences(options.data):
         peer = Multiway(
             data.voxel,
@@ -31,24 +36,47 @@ def cases(options: Options) -> Iterator[Case]:
             data.least,
             camera_at_origin=data.camera_at_origin,
         )
-        own = [
-            Method(
-                f"jaxreg reconstruct, {order}",
-                "jaxreg",
-                f"order={order!r}",
-                partial(by_reconstruct, order, data.scans),
-            )
-            for order in ("any", "sequential")
-        ]
-        yield Case(
-            name=data.name,
-            data=f"{len(data.scans)} scans of {len(data.scans[0])} points",
-            methods=[*own, peer_method(peer, partial(by_peer, peer, data.scans))],
-            trials=[(seed,) for seed in range(3)],
-            judge=partial(judge, data),
-            long=True,
-            reference=PEER,
-        )
+        multiway = peer_method(peer, partial(by_peer, peer, data.scans))
+        own = [_own(data, order) for order in ("any", "sequential")]
+        yield _case(data, [*own, _odometry(data), multiway], PEER)
+    drive = Sequence(
+        f"street there and back, {_FRAMES} frames (generated)",
+        *street_drive(5, _FRAMES),
+        voxel=VOXEL,
+        least=0.3,
+        camera_at_origin=True,
+    )
+    yield _case(drive, [_own(drive, "sequential"), _odometry(drive)], _ODOMETRY)
+
+
+def _case(data: Sequence, methods: list[Method], reference: str) -> Case:
+    return Case(
+        name=data.name,
+        data=f"{len(data.scans)} scans of {len(data.scans[0])} points",
+        methods=methods,
+        trials=[(seed,) for seed in range(3)],
+        judge=partial(judge, data),
+        long=True,
+        reference=reference,
+    )
+
+
+def _own(data: Sequence, order: str) -> Method:
+    return Method(
+        f"jaxreg reconstruct, {order}",
+        "jaxreg",
+        f"order={order!r}",
+        partial(by_reconstruct, order, data.scans),
+    )
+
+
+def _odometry(data: Sequence) -> Method:
+    return Method(
+        _ODOMETRY,
+        "kiss-icp",
+        f"voxel {VOXEL} m, no deskewing",
+        partial(by_odometry, data.scans),
+    )
 
 
 def by_reconstruct(order, scans: list[np.ndarray], seed: int) -> Placed:
@@ -56,6 +84,11 @@ def by_reconstruct(order, scans: list[np.ndarray], seed: int) -> Placed:
     found = reconstruct(scans, order=order, key=jax.random.key(seed))
     component = np.where(np.asarray(found.placed), np.asarray(found.component), -1)
     return component, np.asarray(found.T_world_i, float)
+
+
+def by_odometry(scans: list[np.ndarray], seed: int) -> Placed:
+    """Frame by frame; nothing is drawn."""
+    return np.zeros(len(scans), int), kiss_odometry(scans)
 
 
 def by_peer(peer: Multiway, scans: list[np.ndarray], seed: int) -> Placed:
