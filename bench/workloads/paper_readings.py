@@ -7,6 +7,7 @@ from bench.workloads import readings_averaging, readings_filter
 
 
 def cases(options: Options) -> Iterator[Case]:
-    """Those of the particle filter, then those of motion averaging."""
+    """The best of each paper with what stands beside it, then the horse's others."""
     yield from readings_filter.cases(options)
     yield from readings_averaging.cases(options)
+    yield from readings_filter.other_cases(options)

@@ -35,11 +35,11 @@ def sandhu2010(
     answer is the particle of least energy at the end.
 
     Not printed, so chosen here, as what comes nearest to the paper's figures: that the
-    expectation of Eq. 7 is over all particles measured, and that a tenth of them are an
-    effective sample at each time: so the temperature of the likelihoods is learned (the
-    printed exponent has the wrong sign and underflows). The prior and the number of
-    times are not printed either. `python -m bench --only paper_readings` compares
-    readings.
+    expectation of Eq. 7 is over all particles measured, and that three tenths of them
+    are an effective sample at each time: so the temperature of the likelihoods is
+    learned (the printed exponent has the wrong sign and underflows). The prior and the
+    number of times are not printed either. `python -m bench --only paper_readings`
+    compares readings.
 
     Args:
         d: 2 or 3.
@@ -80,6 +80,6 @@ def sandhu2010(
         kernel=L2(),
         step=GradientDescent() if d == 2 else GaussNewton(),
         prior_error_share=1.0,
-        sample_share=0.1,
+        sample_share=0.3,
         dim=int(d),
     )
