@@ -1,7 +1,7 @@
 """Every public method and part keeps its contract, inside `jit`, `vmap` and `grad`."""
 
 import inspect
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -42,6 +42,7 @@ from jaxreg.testing import (
     check_residual,
     check_step,
 )
+from jaxreg.testing.problems import EDGES, NUM_POSES, relative_motions
 from jaxreg.testing.promises import (
     promise_dtypes,
     promise_round_trips,
@@ -71,9 +72,17 @@ def _name(x: Any) -> str:
 
 @pytest.fixture(autouse=True, scope="module")
 def _strict() -> Iterator[None]:
-    """What is not a number raises. Compiled in a hurry: these programs run once."""
-    with switched_on("jax_debug_nans"):
+    """What is not a number raises, and ranks that are raised without a word."""
+    with switched_on("jax_debug_nans"), jax.numpy_rank_promotion("raise"):
         yield
+
+
+def _transfers_nothing_unasked(call: Callable[..., Any], *arrays: Any) -> None:
+    """The call, first traced and then compiled; with arrays that are on the device."""
+    given = jax.device_put(arrays)
+    with jax.transfer_guard("disallow"):
+        for _ in range(2):
+            jax.block_until_ready(call(*given))
 
 
 def _concrete(base: type) -> set[type]:
@@ -119,13 +128,34 @@ def test_methods_of_register(name, monkeypatch):
     monkeypatch.setattr(last_digits, "_STEPS", 120)
     # Searches compile long: once, in the plane.
     d = 2 if row.promises.get("draws") else 3
-    check_registrar(row.make(d), d=d, **row.promises)
+    method = row.make(d)
+    with jax.enable_x64(True):
+        clouds = pair(d, float)
+        given = *clouds, np.eye(d + 1), *(np.ones(len(x), bool) for x in clouds)
+        _transfers_nothing_unasked(
+            lambda source, target, init, *masks: jr.register(
+                *(source, target, method, init, KEY),
+                source_mask=masks[0],
+                target_mask=masks[1],
+            ),
+            *given,
+        )
+    check_registrar(method, d=d, **row.promises)
 
 
 @pytest.mark.parametrize("name", _marked(AVERAGERS))
 def test_methods_of_average(name):
     row = AVERAGERS[name]
-    check_averager(row.make(3), **row.promises)
+    method = row.make(3)
+    with jax.enable_x64(True):
+        _transfers_nothing_unasked(
+            lambda T, weight, mask: jr.average(
+                jr.PoseGraph.from_edges(EDGES, T, NUM_POSES, weight, mask=mask),
+                *(method, None, KEY),
+            ),
+            *(relative_motions(3, 0.035), np.ones(len(EDGES)), EDGES[:, 0] >= 0),
+        )
+    check_averager(method, **row.promises)
 
 
 @pytest.mark.parametrize("index", _marked(INDEXES))

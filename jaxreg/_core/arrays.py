@@ -26,7 +26,8 @@ def _as_scalar(x: float | Array | None) -> Array | None:
     if not _is_number(x):
         return x  # pyright: ignore[reportReturnType]
     try:
-        return jnp.asarray(x, dtype=jnp.result_type(float))
+        # Put there in so many words, which every transfer guard allows.
+        return jax.device_put(np.asarray(x, dtype=jnp.result_type(float)))
     except OverflowError:  # an integer of hundreds of digits: its check says so
         return x  # pyright: ignore[reportReturnType]
 

@@ -70,7 +70,7 @@ def check_points(points: Array, name: str) -> int:
 def check_mask(mask: object, shape: tuple[int, ...], name: str) -> Array:
     """Returns a boolean mask of `shape`; None stands for everything valid."""
     if mask is None:
-        return jnp.ones(shape, dtype=bool)
+        return jax.device_put(np.ones(shape, dtype=bool))
     out = mask if isinstance(mask, jax.Array) else as_host_array(mask, name)
     if out.dtype != bool:
         raise TypeError(f"{name}: wanted a boolean mask, found dtype {out.dtype}.")

@@ -139,13 +139,14 @@ class Solver(AbstractParted):
         wide, dtype = jnp.result_type(float), start.dtype
         run: Any = optimistix.least_squares if self.takes_rows else optimistix.minimise
         small = rows if self.takes_rows else energy
-        found = run(
-            _Widened(small, dtype),
-            self.whole(wide),
-            start.astype(wide),
-            max_steps=max_steps,
-            throw=False,
-        )
+        with jax.transfer_guard("allow"):  # it makes a flag on the device when traced
+            found = run(
+                _Widened(small, dtype),
+                self.whole(wide),
+                start.astype(wide),
+                max_steps=max_steps,
+                throw=False,
+            )
         return Lowered(
             jax.lax.stop_gradient(found.value).astype(dtype),
             found.result == optimistix.RESULTS.successful,

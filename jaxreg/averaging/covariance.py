@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import check_count
@@ -62,8 +63,10 @@ def pose_covariances(
             f"found {graph.num_poses}."
         )
     covariances = _covariances(whole, placed)[first:]
-    frames = [row[0] for row in fixed or ()]
-    return covariances.at[jnp.asarray(frames, jnp.int32)].set(0)
+    if not fixed:
+        return covariances
+    frames = np.array([row[0] for row in fixed], np.int32)
+    return covariances.at[jax.device_put(frames)].set(0)
 
 
 @kept_program

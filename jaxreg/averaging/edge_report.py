@@ -128,7 +128,9 @@ def edge_report(
         trusted = given & usable
         held = np.unique(np.append(np.asarray(graph.edges)[trusted], 0))
         few = graph.num_poses * lie.tangent_dim(graph.dim) <= max_unknowns
-        at = jax.tree.map(np.asarray, _linearised(wide, T, jnp.asarray(trusted), few))
+        at = jax.tree.map(
+            np.asarray, _linearised(wide, T, jax.device_put(trusted), few)
+        )
     r, weights = np.where(sound[:, None], at.residual, np.nan), at.information
     eps = float(jnp.finfo(graph.T_i_j.dtype).eps)
     k, ranks = r.shape[1], _ranks(weights, graph.dim, eps)

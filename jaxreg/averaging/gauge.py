@@ -64,7 +64,7 @@ def _prepared(
     if init is not None:
         sound = jnp.all(jnp.isfinite(init), axis=(1, 2))
         finite = finite & jnp.all(sound)
-        init = jnp.where(sound[:, None, None], init, jnp.eye(d + 1, dtype=dtype))
+        init = jnp.where(sound[:, None, None], init, T_world_0[None])
         T_world_0 = init[0]
         T_0_i = lie.between(T_world_0, init)
         T_start = lie.compose(lie.rotation(T_0_i), lie.translation(T_0_i) / unit)
@@ -77,7 +77,7 @@ def _placed(
 ) -> AveragingSolution:
     out = out.in_unit(gauge.unit)
     T_0_i, placed = out.T_world_i, gauge.component == gauge.component[0]
-    eye = jnp.eye(T_0_i.shape[-1], dtype=T_0_i.dtype)
+    eye = jnp.eye(T_0_i.shape[-1], dtype=T_0_i.dtype)[None]
     sound = jnp.all(jnp.isfinite(T_0_i), axis=(1, 2))
     T_world_i = jnp.where(sound[:, None, None], gauge.T_world_0 @ T_0_i, eye)
     T_world_i = jnp.where(placed[:, None, None], T_world_i, eye)
@@ -108,7 +108,7 @@ def _reduce(graph: PoseGraph) -> tuple[PoseGraph, Array, Array]:
     component = trees.components(graph.edges, weight, graph.num_poses)
     placed = component == component[0]
     used = used & placed[graph.edges[:, 0]]
-    eye = jnp.eye(graph.dim + 1, dtype=graph.T_i_j.dtype)
+    eye = jnp.eye(graph.dim + 1, dtype=graph.T_i_j.dtype)[None]
     info = graph.information
     reduced = PoseGraph(
         edges=jnp.where(used[:, None], graph.edges, 0),

@@ -130,13 +130,13 @@ def explained(
     graph, T_world_i = jax.lax.stop_gradient((graph, T_world_i))
     sq, weigh = squared_errors(graph, T_world_i), prior_odds(graph)
     log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
-    prior = log_odds[:, None] + weigh
+    prior = log_odds[:, None] + weigh[None]
     none = jax.nn.softplus(prior)
     rank = _neighbour_rank(graph, T_world_i)[None]
     bound = jnp.asarray((*_NEAREST, jnp.iinfo(rank.dtype).max))[:, None]
     is_near = (rank < bound).astype(sq.dtype)  # (t + 1, e)
     band = jnp.diff(is_near, axis=0, prepend=0)
-    allowed = log_odds[:, None] >= jnp.maximum(log_odds, 0)  # near, far
+    allowed = log_odds[:, None] >= jnp.maximum(log_odds, 0)[None]  # near, far
     free, reach = graph.num_held - 1, _reach(graph.dim)
 
     def log_gain(deviation: Array) -> tuple[Array, Array]:
@@ -146,7 +146,8 @@ def explained(
 
     def terms(deviation: Array) -> Array:
         gain, most = log_gain(deviation)
-        each = jnp.where(graph.weight > 0, jax.nn.softplus(prior + gain) - none, 0)
+        each = jax.nn.softplus(prior + gain[None]) - none
+        each = jnp.where(graph.weight[None] > 0, each, 0)
         part = jnp.matmul(each, band.T, precision=jax.lax.Precision.HIGHEST)
         near = jnp.cumsum(part, axis=1)[:, :-1]
         far = jnp.cumsum(part[:, ::-1], axis=1)[:, -2::-1]

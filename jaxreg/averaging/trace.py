@@ -42,7 +42,7 @@ class AveragingTrace(BriefModule):
     def in_unit(self, length: Float[Array, ""]) -> "AveragingTrace":
         """With kernel widths in another unit of length, which is `1 / length`."""
         unit = jnp.stack([length, jnp.ones_like(length)])
-        return dataclasses.replace(self, kernel_width=self.kernel_width * unit)
+        return dataclasses.replace(self, kernel_width=self.kernel_width * unit[None])
 
 
 def no_rows(num: int, dtype: jnp.dtype) -> Float[Array, "s 4"]:

@@ -110,11 +110,18 @@ def stacked(arrays: Sequence[Array], num_rows: int) -> Array:
         out = np.zeros(shape, arrays[0].dtype)
         for row, x in zip(out, arrays, strict=True):
             row[: len(x)] = x
-        return jnp.asarray(out)
+        return jax.device_put(out)
     out = jnp.zeros(shape, arrays[0].dtype)
     for i, x in enumerate(arrays):
         out = out.at[i, : len(x)].set(x)
     return out
+
+
+def lengthened(x: Array, num_rows: int) -> Array:
+    """A concrete array with rows of zero, or False, behind its own."""
+    out = np.zeros((num_rows, *x.shape[1:]), x.dtype)
+    out[: len(x)] = x
+    return jax.device_put(out)
 
 
 def unstacked(tree: Tree, num: int) -> list[Tree]:

@@ -44,7 +44,7 @@ def cell_keys(
 ) -> Int[Array, " n"]:
     """Morton numbers of the cells of `(n, d)` points; `UNUSED` where masked."""
     last = (1 << bits_per_axis(points.shape[1])) - 1
-    cells = jnp.clip((points - low) / size, 0, last).astype(jnp.int32)
+    cells = jnp.clip((points - low[None]) / size, 0, last).astype(jnp.int32)
     return jnp.where(mask, morton_keys(cells.T), UNUSED)
 
 

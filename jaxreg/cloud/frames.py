@@ -81,5 +81,5 @@ def _distinct_enough(points: Array, mask: Array) -> Array:
     new, num = mask, jnp.zeros((), jnp.int32)
     for _ in range(points.shape[1] + 1):
         num = num + jnp.any(new)
-        new = new & jnp.any(points != points[jnp.argmax(new)], axis=1)
+        new = new & jnp.any(points != points[jnp.argmax(new)][None], axis=1)
     return num > points.shape[1]

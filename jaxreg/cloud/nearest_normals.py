@@ -45,7 +45,7 @@ def normals_from_neighbours(
     found = BruteForce.build(frozen, mask).query(frozen, k)
     row, valid = found.index.T, found.valid.T
     weight = jnp.where(valid, count[row], 0)
-    delta = [places[:, i][row] - places[:, i] for i in range(d)]
+    delta = [places[:, i][row] - places[None, :, i] for i in range(d)]
     if fading:
         sq = sum(x * x for x in delta)
         last = jnp.max(jnp.where(valid, sq, 0), axis=0)
@@ -53,14 +53,15 @@ def normals_from_neighbours(
     total = jnp.sum(weight, axis=0)
     total = jnp.where(total > 0, total, 1)
     mean = [jnp.sum(weight * x, axis=0) / total for x in delta]
+    off = [x - m[None] for x, m in zip(delta, mean, strict=True)]
     moments = [[total] * d for _ in range(d)]
     for i in range(d):
         for j in range(i, d):
             inner = jnp.where(valid, spread[:, i, j][row], 0)
-            outer = weight * (delta[i] - mean[i]) * (delta[j] - mean[j])
+            outer = weight * off[i] * off[j]
             moments[i][j] = moments[j][i] = jnp.sum(inner + outer, axis=0) / total
     entries = jnp.stack([jnp.stack(line) for line in moments])
     vectors, second, largest = least_eigenvectors(entries)
     flat = mask & (largest > 0) & (second > _SPAN * largest)
     near = jax.tree.map(lambda x: x[:, : 1 + num_around(d)], found)
-    return jnp.where(flat, vectors, 0).T, spacing_around(near, mask)
+    return jnp.where(flat[None], vectors, 0).T, spacing_around(near, mask)

@@ -94,7 +94,7 @@ class Windows(eqx.Module):
         def at_level(normals: Array, level: Array) -> Array:
             cells = _moments_of_cells(self.points, self.keys, self.size, level)
             vectors = _least_spread(self.places, cells, self.size, level)[0]
-            return jnp.where(self.level == level, vectors, normals)
+            return jnp.where((self.level == level)[None], vectors, normals)
 
         @jax.checkpoint
         def fill(normals: Array, level: Array) -> tuple[Array, None]:
@@ -145,7 +145,7 @@ def _search(
             at = lax.dynamic_slice_in_dim(rows, b * width, width)
             vectors, spans = _least_spread(places[at], cells, size, level)
             new = spans & ~done[at]
-            vectors = jnp.where(new, vectors, normals[:, at])
+            vectors = jnp.where(new[None], vectors, normals[:, at])
             return (
                 normals.at[:, at].set(vectors),
                 levels.at[at].set(jnp.where(new, level, levels[at])),
@@ -173,18 +173,19 @@ def _least_spread(
     offset = at - base
     last = (1 << (bits_per_axis(d) - level)) - 1
     corners = np.array(list(itertools.product((0, 1), repeat=d)))
-    cell = base.astype(jnp.int32) + corners[:, :, None]  # (2^d, d, p)
+    cell = base.astype(jnp.int32)[None] + corners[:, :, None]  # (2^d, d, p)
     inside = jnp.all((cell >= 0) & (cell <= last), axis=1)
     key = morton_keys(jnp.swapaxes(jnp.clip(cell, 0, last), 0, 1))
     row = jnp.minimum(jnp.searchsorted(cell_key, key), len(cell_key) - 1)
-    weight = jnp.prod(jnp.where(corners[:, :, None] == 1, offset, 1 - offset), axis=1)
+    far, offset = corners[:, :, None] == 1, offset[None]
+    weight = jnp.prod(jnp.where(far, offset, 1 - offset), axis=1)
     weight = jnp.where(inside & (cell_key[row] == key), weight, 0)
     num = jnp.sum(jnp.where(weight > 0, moments[0, row], 0), axis=0)
-    near = (weight * moments[:, row]).reshape(-1, places.shape[0])
+    near = (weight[None] * moments[:, row]).reshape(-1, places.shape[0])
     shift = jnp.asarray(_shift_to_base(corners), at.dtype)
     total = jnp.matmul(shift, near, precision=lax.Precision.HIGHEST)
     count = jnp.where(total[0] > 0, total[0], 1)
-    mean = total[1 : d + 1] / count
+    mean = total[1 : d + 1] / count[None]
     spread = [
         [total[_place_of(i, j, d)] / count - mean[i] * mean[j] for j in range(d)]
         for i in range(d)
@@ -212,7 +213,7 @@ def _moments_of_cells(
     x = x - jnp.floor(x) - 0.5
     rows = [jnp.ones_like(x[0]), *x]
     rows += [x[i] * x[j] for i in range(d) for j in range(i, d)]
-    rows = jnp.where(key == UNUSED, 0, jnp.stack(rows))
+    rows = jnp.where((key == UNUSED)[None], 0, jnp.stack(rows))
     sums = jax.ops.segment_sum(rows.T, cell, n, indices_are_sorted=True)
     return cell_key, sums.T
 

@@ -133,13 +133,13 @@ def centroid(points: Points, mask: Mask) -> Float[Array, " d"]:
     """The mean of the valid points (zero where there are none)."""
     weight = mask.astype(points.dtype)
     first = points[jnp.argmax(mask)]  # sums of differences: safe far from the origin
-    mean = jnp.sum(weight[:, None] * (points - first), axis=0)
+    mean = jnp.sum(weight[:, None] * (points - first[None]), axis=0)
     return first + mean / jnp.maximum(jnp.sum(weight), 1)
 
 
 def rms_radius(points: Points, mask: Mask) -> Float[Array, ""]:
     """Root mean square distance of the valid points from their centroid."""
-    offset = jnp.where(mask[:, None], points - centroid(points, mask), 0)
+    offset = jnp.where(mask[:, None], points - centroid(points, mask)[None], 0)
     num = jnp.maximum(jnp.sum(mask), 1).astype(points.dtype)
     mean = jnp.sum(offset**2) / num
     # The root of zero has no finite slope.

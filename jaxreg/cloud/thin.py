@@ -52,7 +52,7 @@ def thin(
     n = points.shape[0]
     merge = n > capacity
     low, size, rows, keys = _cells(points, mask, capacity if merge else None)
-    ordered, valid = points[rows] - low, mask[rows]
+    ordered, valid = points[rows] - low[None], mask[rows]
     places = jnp.where(valid[:, None], ordered, 0)
     samples, num = places, jnp.sum(mask)
     cell = jnp.arange(n, dtype=jnp.int32)
@@ -76,7 +76,7 @@ def thin(
         normals, spacing = normals_from_neighbours(
             places, valid, count, spread, num_neighbours, fading
         )
-    points = jnp.where(valid[:, None], places + low, 0)
+    points = jnp.where(valid[:, None], places + low[None], 0)
     return PointCloud(points, normals, valid, spacing=spacing, window=window)
 
 

@@ -117,7 +117,7 @@ def newton_step(model: Quadratic, b: Float[Array, " k"]) -> Float[Array, " k"]:
     held = curvature > _FREE
     along = jnp.sum(vector * (unit * b)[:, None], axis=0)
     along = jnp.where(held, along / jnp.where(held, curvature, 1), 0)
-    return unit * jnp.sum(vector * along, axis=1)
+    return unit * jnp.sum(vector * along[None], axis=1)
 
 
 class Maximum(AbstractRest):
@@ -165,12 +165,12 @@ def _damped_step(model: Quadratic, damping: Float[Array, ""]) -> Float[Array, " 
     curvature = jnp.where(curvature < 0, jnp.minimum(-curvature, 1), curvature)
     along = jnp.sum(vector * (unit * model.b)[:, None], axis=0)
     along = along / (curvature + damping)
-    return unit * jnp.sum(vector * along, axis=1)
+    return unit * jnp.sum(vector * along[None], axis=1)
 
 
 def _principal(model: Quadratic) -> tuple[Array, Array, Array]:
     """Curvatures and directions in units in which the stiffness is one, and those."""
     stiff = model.stiffness > 0
     unit = jnp.where(stiff, 1 / jnp.sqrt(jnp.where(stiff, model.stiffness, 1)), 0)
-    curvature, vector = eigh(model.H * unit[:, None] * unit)
+    curvature, vector = eigh(model.H * unit[:, None] * unit[None])
     return curvature, vector, unit

@@ -73,7 +73,7 @@ def pair_sums(
     for p, (i, j) in enumerate(upper):
         second = sums[:, d + 1 + p] - at[i] * first[j] - at[j] * first[i]
         spread[i][j] = spread[j][i] = second + at[i] * at[j] * value
-    pull = first - at * value
+    pull = first - at * value[None]
     return PairSums(value, pull, jnp.stack([jnp.stack(row) for row in spread]))
 
 
@@ -104,7 +104,9 @@ def kernel_correlation(
     @jax.checkpoint
     def of_tile(tile: Float[Array, "d t"]) -> Float[Array, " t"]:
         k = _kernel(tile, columns, width)
-        return jnp.sum(k if target_mask is None else jnp.where(target_mask, k, 0), 1)
+        if target_mask is not None:
+            k = jnp.where(target_mask[None], k, 0)
+        return jnp.sum(k, axis=1)
 
     value = _by_tiles(of_tile, source.T, target.shape[0])[: source.shape[0]]
     return jnp.sum(value if source_mask is None else jnp.where(source_mask, value, 0))
@@ -113,9 +115,9 @@ def kernel_correlation(
 def _kernel(
     tile: Float[Array, "d t"], columns: Float[Array, "d m"], bandwidth: Array
 ) -> Float[Array, "t m"]:
-    sq = (tile[0][:, None] - columns[0]) ** 2
+    sq = (tile[0][:, None] - columns[0][None]) ** 2
     for axis in range(1, columns.shape[0]):
-        sq = sq + (tile[axis][:, None] - columns[axis]) ** 2
+        sq = sq + (tile[axis][:, None] - columns[axis][None]) ** 2
     return jnp.exp(sq * (-0.5 / bandwidth**2))
 
 

@@ -55,12 +55,13 @@ class Quadratic(eqx.Module):
         by_source = _wrench(lever, sums.pull)
 
         eye = jnp.eye(d, dtype=lever.dtype)
+        values = eye[:, :, None] * sums.value[None, None]
         # Rows e_i . d(R p + t) / d(v, w), `(d, k, n)`.
         J = jnp.stack([_wrench(lever, _constant(row, lever)) for row in eye])
-        pairs_H = eye[:, :, None] * sums.value - sums.spread / bandwidth**2
+        pairs_H = values - sums.spread / bandwidth**2
         H = _quadratic_form(J, pairs_H) + _bending(lever, sums)
-        stiffness = jnp.sum(jnp.sum(J * J, axis=0) * sums.value, axis=1)
-        links = _quadratic_form(J, eye[:, :, None] * sums.value)
+        stiffness = jnp.sum(jnp.sum(J * J, axis=0) * sums.value[None], axis=1)
+        links = _quadratic_form(J, values)
         return cls(
             correlation=jnp.sum(sums.value),
             H=H,
@@ -100,7 +101,7 @@ def _quadratic_form(
 ) -> Float[Array, "k k"]:
     """The sum of J^T M J over points."""
     d, k, n = J.shape
-    MJ = jnp.stack([sum(M[i, j] * J[j] for j in range(d)) for i in range(d)])
+    MJ = jnp.stack([sum(M[i, j][None] * J[j] for j in range(d)) for i in range(d)])
     rows = jnp.swapaxes(J, 0, 1).reshape(k, d * n)
     others = jnp.swapaxes(MJ, 0, 1).reshape(k, d * n)
     return jnp.matmul(rows, others.T, precision=lax.Precision.HIGHEST)

@@ -43,18 +43,19 @@ def _least_eigenvectors_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tu
     n, second, largest = least_eigenvectors(a)
     least = _dot(n, _times(a, n))
     eye = jnp.eye(len(n), dtype=a.dtype)[:, :, None]
-    b = a - least * eye
+    b = a - least[None, None] * eye
     pull = _times(da, n)
-    pull = pull - n * _dot(n, pull)
+    pull = pull - n * _dot(n, pull)[None]
     total = jnp.trace(b)
     if len(n) == 2:
         turn, determinant = pull, total
     else:
-        turn = total * pull - _times(b, pull)
+        turn = total[None] * pull - _times(b, pull)
         minors = [b[i, i] * b[j, j] - b[i, j] ** 2 for i, j in ((0, 1), (0, 2), (1, 2))]
         determinant = minors[0] + minors[1] + minors[2]
     unit = jnp.maximum(largest, 0) ** (len(n) - 1)
     apart = determinant > _APART * jnp.finfo(a.dtype).eps * unit
+    apart, determinant = apart[None], determinant[None]
     turn = jnp.where(apart, -turn / jnp.where(apart, determinant, 1), 0)
     zero = jnp.zeros_like(second)
     return (n, second, largest), (turn, zero, zero)
@@ -79,7 +80,7 @@ def _in_space(a: Array) -> tuple[Array, Array, Array]:
     """Smith 1961, Eigenvalues of a symmetric 3 x 3 matrix."""
     mean = (a[0, 0] + a[1, 1] + a[2, 2]) / 3
     scale = jnp.maximum(mean, jnp.finfo(a.dtype).tiny ** 0.25)
-    a, mean = a / scale, mean / scale
+    a, mean = a / scale[None, None], mean / scale
     xx, yy, zz = a[0, 0] - mean, a[1, 1] - mean, a[2, 2] - mean
     xy, xz, yz = a[0, 1], a[0, 2], a[1, 2]
     size = jnp.sqrt((xx**2 + yy**2 + zz**2 + 2 * (xy**2 + xz**2 + yz**2)) / 6)
@@ -97,9 +98,9 @@ def _in_space(a: Array) -> tuple[Array, Array, Array]:
     vector, sq_length = _cross(rows[0], rows[1])
     for i, j in ((0, 2), (1, 2)):
         other, sq_other = _cross(rows[i], rows[j])
-        vector = jnp.where(sq_other > sq_length, other, vector)
+        vector = jnp.where((sq_other > sq_length)[None], other, vector)
         sq_length = jnp.maximum(sq_length, sq_other)
-    length = jnp.sqrt(sq_length)
+    length = jnp.sqrt(sq_length)[None]
     vector = jnp.where(length > 0, vector / jnp.where(length > 0, length, 1), 0)
     return vector, middle * scale, largest * scale
 

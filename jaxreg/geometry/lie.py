@@ -108,7 +108,8 @@ def log_jacobian(tangent: Float[Array, "*b k"]) -> Float[Array, "*b k k"]:
     b = jnp.where(wide, (slope - h + 1) / safe**2, -1 / 720 - sq / 15120)
     ad2 = jnp.einsum("...ab,...bc->...ac", ad, ad)
     ad4 = jnp.einsum("...ab,...bc->...ac", ad2, ad2)
-    return jnp.eye(k, dtype=ad.dtype) + ad / 2 + a * ad2 + b * ad4
+    eye = jnp.broadcast_to(jnp.eye(k, dtype=ad.dtype), ad.shape)
+    return eye + ad / 2 + a * ad2 + b * ad4
 
 
 def _hat(w: Float[Array, "*b r"]) -> Float[Array, "*b d d"]:
@@ -201,7 +202,8 @@ def act(T: Float[Array, "D D"], points: Float[Array, "*n d"]) -> Float[Array, "*
     Written as a broadcast multiply and sum: a matrix product may be run in reduced
     precision on accelerators.
     """
-    R, t = rotation(T), translation(T)
+    batch = tuple(range(points.ndim - 1))
+    R, t = (jnp.expand_dims(x, batch) for x in (rotation(T), translation(T)))
     return jnp.sum(points[..., None, :] * R, axis=-1) + t
 
 

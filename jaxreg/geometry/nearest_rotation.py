@@ -81,7 +81,8 @@ def _in_space(M: Array) -> Array:
     U = _right_handed(u, _unit(rest))
     V = _right_handed(V[..., 0, :], V[..., 1, :])
     R = jnp.swapaxes(U, -1, -2) @ V
-    return jnp.where(nothing[..., None, None], jnp.eye(3, dtype=M.dtype), R)
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=M.dtype), R.shape)
+    return jnp.where(nothing[..., None, None], eye, R)
 
 
 def _swept(US: Array, V: Array) -> tuple[Array, Array]:

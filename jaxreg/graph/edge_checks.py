@@ -115,7 +115,7 @@ def check_motions(motions: Array, ids: Array, valid: Array) -> Array:
     U, _, Vt = np.linalg.svd(R[off])
     T[off, :d, :d] = U @ Vt
     T[:, d] = np.eye(d + 1)[d]
-    return jnp.asarray(T.astype(motions.dtype))
+    return jax.device_put(T.astype(motions.dtype))
 
 
 def check_weights(weights: Array | None, ids: Array, valid: Array) -> None:

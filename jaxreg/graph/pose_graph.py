@@ -127,7 +127,7 @@ class PoseGraph(eqx.Module):
         def where(real: Any, x: Array, other: Any) -> Array:
             return put((np if on_host else jnp).where(real, host(x), other))
 
-        eye = np.eye(self.T_i_j.shape[-1], dtype=self.T_i_j.dtype)
+        eye = np.eye(self.T_i_j.shape[-1], dtype=self.T_i_j.dtype)[None]
         info = self.information
         return PoseGraph(
             edges=where(mask[:, None], self.edges, 0),

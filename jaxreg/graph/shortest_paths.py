@@ -89,7 +89,7 @@ def shortest_paths(
     parent = jnp.where(has, jnp.where(backward, j[e], i[e]), frames)
     eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
     T_parent = jnp.where(backward[:, None, None], lie.inverse(T_i_j[e]), T_i_j[e])
-    T_parent = jnp.where(has[:, None, None], T_parent, eye)
+    T_parent = jnp.where(has[:, None, None], T_parent, eye[None])
     via = jnp.where(has, e, num_edges)
     return Paths(follow(parent, T_parent)[1], reached, parent, via)
 

@@ -97,7 +97,7 @@ def maximum_spanning_tree(
     reached = end.component == end.component[0]
     T_world_i = lie.between(end.T_root_i[0], end.T_root_i)
     eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
-    T_world_i = jnp.where(reached[:, None, None], T_world_i, eye).at[0].set(eye)
+    T_world_i = jnp.where(reached[:, None, None], T_world_i, eye[None]).at[0].set(eye)
     return Forest(T_world_i, reached, end.component, end.in_tree)
 
 
@@ -131,7 +131,7 @@ def _join_components(
     T_ri_rj = product(product(X_i, T_i_j[e]), lie.inverse(X_j))
     T_parent_c = jnp.where(outward[:, None, None], lie.inverse(T_ri_rj), T_ri_rj)
     eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
-    T_parent_c = jnp.where(hooks[:, None, None], T_parent_c, eye)
+    T_parent_c = jnp.where(hooks[:, None, None], T_parent_c, eye[None])
     root, T_top_c = follow(parent, T_parent_c)
     in_tree = state.in_tree.at[jnp.where(hooks, best, num_edges)].set(True, mode="drop")
     return _Boruvka(

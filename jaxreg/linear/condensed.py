@@ -41,7 +41,7 @@ def _condensed_jvp(
     primals: tuple[AbstractSquares, Array], tangents: tuple
 ) -> tuple[Array, Array]:
     rows, slopes = _rows(*primals)
-    along = jnp.sum(slopes * tangents[1], axis=1)
+    along = jnp.sum(slopes * tangents[1][None], axis=1)
     return rows, jnp.append(along, jnp.zeros_like(along[0]))
 
 

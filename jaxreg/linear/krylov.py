@@ -64,11 +64,11 @@ def conjugate_gradients(
         stop = jnp.where(s.step == 0, tolerance**2 * rz, s.stop)
         curved = s.curvature > 0
         beta = jnp.where(curved, -dot(z, s.Ap) / jnp.where(curved, s.curvature, 1), 0)
-        p = z + beta * s.p
+        p = z + beta[None, None] * s.p
         Ap = apply(p)
         curvature = dot(p, Ap)
         alive = (curvature > 0) & (rz > 0) & (s.rz > s.stop)
-        a = jnp.where(alive, rz / jnp.where(alive, curvature, 1), 0)
+        a = jnp.where(alive, rz / jnp.where(alive, curvature, 1), 0)[None, None]
         rz = jnp.where(alive, rz, 0)
         return _State(s.x + a * p, s.r - a * Ap, p, Ap, curvature, rz, stop, s.step + 1)
 

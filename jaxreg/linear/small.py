@@ -20,6 +20,8 @@ def product(
     A: Float[Array, "*#b p q"], B: Float[Array, "*#b q r"]
 ) -> Float[Array, "*b p r"]:
     """A @ B for many small matrices: a broadcast sum is several times faster on CPU."""
+    rank = max(A.ndim, B.ndim)
+    A, B = (jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in (A, B))
     return jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2)
 
 
@@ -185,7 +187,7 @@ def least_norm_solution(
     held = jnp.abs(value) > share * jnp.max(jnp.abs(value))
     along = jnp.sum(vector[:n] * b[:, None], axis=0)
     along = jnp.where(held, along / jnp.where(held, value, 1), 0)
-    return jnp.sum(vector[n:] * along, axis=1)
+    return jnp.sum(vector[n:] * along[None], axis=1)
 
 
 @jax.custom_jvp

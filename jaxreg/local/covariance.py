@@ -69,7 +69,7 @@ def pose_covariance(
     """
     weight = optimiser.weights(found, width)
     H, _ = optimiser.residual.normal_equations(found, weight)
-    pulls = optimiser.residual.descents(found) * weight
+    pulls = optimiser.residual.descents(found) * weight[None]
     pulls = jax.ops.segment_sum(pulls.T, found.row, problem.target.shape[0])
     meat = full_matmul(pulls.T, pulls)
     A = answer(optimiser, problem, T_target_source, found, width, weight)
@@ -111,7 +111,7 @@ def answer(
     slope = (before - behind) / (2 * jnp.where(reach > 0, reach, 1))
     slope = slope * jnp.sign(sum_rows(normal * here.normal))
     by_source, by_target = along(normal, here)[:-1], along(here.normal, here)[:-1]
-    A = full_matmul(by_source * slope, by_target.T)
+    A = full_matmul(by_source * slope[None], by_target.T)
     # As if all points had been asked, by the share of the weight of those that were.
     asked = jnp.sum(weight[::every])
     return total / jnp.where(asked > 0, asked, 1) * (A + A.T) / 2
@@ -123,11 +123,12 @@ def inverse_within(
     """A^-1 in the directions that H holds, with A from 0.01 to 1 times H."""
     diagonal = jnp.diagonal(H)
     unit = jnp.where(diagonal > 0, lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1)), 0)
-    value, vector = eigh(H * unit[:, None] * unit)
+    value, vector = eigh(H * unit[:, None] * unit[None])
     held = value > len(H) * jnp.finfo(H.dtype).eps * value[-1]
     root = jnp.where(held, lax.rsqrt(jnp.where(held, value, 1)), 0)
-    white = unit[:, None] * vector * root  # white.T H white = I
+    white = unit[:, None] * vector * root[None]  # white.T H white = I
     share = full_matmul(white.T, full_matmul(A, white))
     value, vector = eigh(share)
     white = full_matmul(white, vector)
-    return full_matmul(white / jnp.clip(value, _LEAST_ANSWER, 1), white.T)
+    share = jnp.clip(value, _LEAST_ANSWER, 1)
+    return full_matmul(white / share[None], white.T)

@@ -67,7 +67,7 @@ class Rest(AbstractRest):
         """b, and the pull on the scale if that is free."""
         found, weight = self._weighed(x)
         residual = self.optimiser.residual
-        b = jnp.sum(weight * residual.descents(found), axis=1)
+        b = jnp.sum(weight[None] * residual.descents(found), axis=1)
         if self.scale is None:
             return b
 

@@ -43,7 +43,7 @@ class Grip(eqx.Module):
         flat = jnp.any(found.normal != 0, axis=0)
         H, _ = PointToPlane(0.0).normal_equations(found, weight * flat)
         H = H + PointToPoint().normal_equations(found, weight * ~flat)[0]
-        return cls(H, jnp.sum(weight * points, axis=1), jnp.sum(weight))
+        return cls(H, jnp.sum(weight[None] * points, axis=1), jnp.sum(weight))
 
     def seen_from(self, T_to_here: Motions) -> "Grip":
         """In another frame."""

@@ -128,6 +128,6 @@ def _in_first_frames(
     T_first_i = lie.between(placement.T_world_i[first], placement.T_world_i)
     T = scans.to_input_frames(T_first_i, first, ids)
     eye = jnp.eye(T.shape[-1], dtype=T.dtype)
-    T = jnp.where((ids != first)[:, None, None], T, eye)
+    T = jnp.where((ids != first)[:, None, None], T, eye[None])
     in_world = scans.to_world(placement.T_world_i)
     return jnp.where((first == placement.world)[:, None, None], in_world, T)

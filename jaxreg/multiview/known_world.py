@@ -51,6 +51,8 @@ class KnownWorld(eqx.Module):
         scans: Float[Array, "v n d"],
     ) -> "KnownWorld | None":
         """From the arguments of `reconstruct`; None if they are."""
+        if all(x is None for x in (priors, fixed, control, levels)):
+            return None
         eye = jnp.eye(scans.shape[-1] + 1, dtype=scans.dtype)[None]
         one = jnp.ones(1, scans.dtype)
         frames = jnp.zeros((1, 2), jnp.int32)

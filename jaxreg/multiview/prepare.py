@@ -146,7 +146,8 @@ def prepare_scan(
     """One scan: cloud, table, exact index, centroid and spacing."""
     mean = centroid(points, mask)
     method = method.in_frames(Frames(mean, mean, radius))
-    cloud = method.prepare((points - mean) / radius, mask).followed().with_spacing()
+    centred = (points - mean[None]) / radius
+    cloud = method.prepare(centred, mask).followed().with_spacing()
     table = index_of(method, cloud)
     spacing = median_spacing(cloud.points, cloud.mask)
     judged, within = cloud.as_judged, spacing

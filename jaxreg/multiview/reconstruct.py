@@ -10,7 +10,6 @@ batches of them at a time, and reports progress.
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.arrays import cast_floats
@@ -221,7 +220,7 @@ def _of_all_pairs(
 ) -> ReconstructionSolution:
     """What can be traced: no pair is chosen by what others told."""
     prepared = prepare_scans(method, *inputs, side_by_side=True)
-    pairs = jnp.asarray(all_pairs(prepared.num_scans))
+    pairs = jax.device_put(all_pairs(prepared.num_scans))
     method, held = jax.lax.stop_gradient((method, prepared))
     motions = relative_motions(method, held, pairs, key)
     return finish(method, averaging, prepared, motions, None, known)

@@ -105,7 +105,7 @@ class Rounds:
         ids = list(map(tuple, pairs.tolist()))
         have = [self.row[pair] for pair in ids if pair in self.row]
         if self.known is not None and have:
-            self.found.append(self.known.rows(jnp.asarray(have)))
+            self.found.append(self.known.rows(jax.device_put(np.array(have))))
         self.found += [self.sure[pair] for pair in ids if pair in self.sure]
         pairs = pairs[[not self._is_known(pair) for pair in ids]]
         total = self.num_tried
@@ -117,7 +117,7 @@ class Rounds:
 
         def run(start: int) -> RelativeMotions:
             rows = np.arange(start, start + _PAIRS_PER_BATCH)
-            batch = jnp.asarray(pairs[np.minimum(rows, len(pairs) - 1)])
+            batch = jax.device_put(pairs[np.minimum(rows, len(pairs) - 1)])
             out = relative_motions(self.method, self.scans, batch, self.key)
             out = jax.block_until_ready(out).rows(
                 jnp.arange(min(_PAIRS_PER_BATCH, len(pairs) - start))
@@ -168,7 +168,8 @@ class Rounds:
             if part[i] != part[j] or self._is_known((i, j)):
                 continue
             self.report("closing loops", done, len(pairs))
-            pair, T_i_j = jnp.array([(i, j)], jnp.int32), lie.between(T[i], T[j])
+            pair = jax.device_put(np.array([(i, j)], np.int32))
+            T_i_j = lie.between(T[i], T[j])
             one = descended(self.method, self.scans, pair, T_i_j[None])
             self._keep(one, float(min_log_evidence(self.method)))
 

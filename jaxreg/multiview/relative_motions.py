@@ -187,12 +187,13 @@ def relative_motions(
         )
         modes = jax.tree.map(lambda x: x[: num_kept(method)], solution.modes)
         T, usable = modes.T_target_source, scans.usable[i] & scans.usable[j]
+        eye = jnp.eye(T.shape[-1], dtype=T.dtype)[None]
         for status in _NO_POSE:
             usable = usable & (solution.status != status)
         sound = usable & jnp.all(jnp.isfinite(T), axis=(1, 2))
         return RelativeMotions(
             pair,
-            jnp.where(sound[:, None, None], T, jnp.eye(T.shape[-1], dtype=T.dtype)),
+            jnp.where(sound[:, None, None], T, eye),
             jnp.where(sound, modes.overlap, 0),
             jnp.where(sound, modes.log_evidence, NO_EVIDENCE),
             jnp.where(sound, modes.inlier_rmse, 0),

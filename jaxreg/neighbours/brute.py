@@ -167,7 +167,8 @@ def _closest_in_group(
     points = jnp.moveaxis(groups[group], 0, -1)
     sq = _ordered(_sq_distance(queries[:, None], points))
     number = jnp.arange(_GROUP, dtype=jnp.int32)[:, None]
-    closest = jnp.min(jnp.where(sq == jnp.min(sq, axis=0), number, _GROUP), axis=0)
+    least = jnp.min(sq, axis=0, keepdims=True)
+    closest = jnp.min(jnp.where(sq == least, number, _GROUP), axis=0)
     return jnp.where(group < 0, -1, group * _GROUP + closest)
 
 
@@ -182,7 +183,8 @@ def _rank(
     number = jnp.sort(number, axis=0)  # ties go to the lowest row
     points = jnp.moveaxis(groups[number], (0, 1, 2, 3), (1, 3, 0, 2))
     sq = _sq_distance(queries[:, None, None], points).reshape(-1, queries.shape[1])
-    row = number[:, None] * _GROUP + jnp.arange(_GROUP, dtype=jnp.int32)[:, None]
+    within = jnp.arange(_GROUP, dtype=jnp.int32)[None, :, None]
+    row = number[:, None] * _GROUP + within
     at = _least_rows(sq, min(k, len(sq)))
     found = jnp.take_along_axis(row.reshape(sq.shape), at, axis=0)
     found = jnp.where(jnp.take_along_axis(sq, at, axis=0) < jnp.inf, found, -1)
@@ -198,8 +200,8 @@ def _least_rows(sq: Float[Array, "n t"], k: int) -> Int[Array, "k t"]:
 
     def next_one(left: Array, _: None) -> tuple[Array, Array]:
         least = jnp.min(left, axis=0)
-        row = jnp.min(jnp.where(left == least, number, len(sq)), axis=0)
-        return jnp.where(number == row, none, left), row
+        row = jnp.min(jnp.where(left == least[None], number, len(sq)), axis=0)
+        return jnp.where(number == row[None], none, left), row
 
     return control.scan(next_one, _ordered(sq), None, length=k)[1]
 

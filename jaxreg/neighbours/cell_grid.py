@@ -209,7 +209,7 @@ def _grid(
     width = jnp.maximum(width, 1e-6 * widest)
     width = jnp.where(width > 0, width, 1)  # not for NaN either, where none is valid
     widths = width * jnp.maximum(widest / width, 1) ** jnp.linspace(0, 1, _WIDTHS)
-    sizes = jnp.floor(extent / widths[:, None]) + 2
+    sizes = jnp.floor(extent[None] / widths[:, None]) + 2
     fits = jnp.prod(sizes, axis=1) <= num_cells
     row = jnp.where(jnp.any(fits), jnp.argmax(fits), _WIDTHS - 1)
     width = widths[row]

@@ -24,7 +24,7 @@ def bulk_extent(
     some, use = spread_rows(mask, _SAMPLES)
     sample = jnp.where(use[:, None], points[some], jnp.nan)
     centre = jnp.nanmedian(sample, axis=0)
-    reach = _REACH * jnp.nanmedian(jnp.max(jnp.abs(sample - centre), axis=1))
+    reach = _REACH * jnp.nanmedian(jnp.max(jnp.abs(sample - centre[None]), axis=1))
     low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0)
     high = jnp.max(jnp.where(mask[:, None], points, -jnp.inf), axis=0)
     return jnp.maximum(low, centre - reach), jnp.minimum(high, centre + reach)

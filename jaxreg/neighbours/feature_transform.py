@@ -145,8 +145,8 @@ def _sq_distance(row: Array, axes: list[Array], centre: list[Array]) -> Array:
 
 def _closer(own: Array, before: Array, axes: list[Array], centre: list[Array]) -> Array:
     """The closer of one candidate each."""
-    mine, theirs = (_sq_distance(row, axes, centre) for row in (own, before))
-    return jnp.where(mine <= theirs, own, before)
+    mine, theirs = (_sq_distance(row[0], axes, centre) for row in (own, before))
+    return jnp.where((mine <= theirs)[None], own, before)
 
 
 def _merge(own: Array, before: Array, axes: list[Array], centre: list[Array]) -> Array:

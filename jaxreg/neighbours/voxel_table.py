@@ -88,7 +88,7 @@ class VoxelTable(AbstractIndex):
         frozen = jnp.where(mask[:, None], lax.stop_gradient(points), 0)
         origin, cell = _grid(frozen, mask, resolution, margin)
         # In units of cells: safe in float32.
-        in_cells = (frozen - origin) / cell
+        in_cells = (frozen - origin[None]) / cell
         rows = feature_transform(in_cells, mask, resolution, candidates)
         if candidates == 1:
             table, coordinates = jnp.maximum(rows[0], 0), None

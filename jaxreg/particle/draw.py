@@ -249,4 +249,6 @@ def _near(particles: Particles, row: Int[Array, ""], limit: float) -> Bool[Array
     R = lie.rotation(particles.T_target_source)
     t = lie.translation(particles.T_target_source)
     turn = lie.rotation_angle(jnp.einsum("pij,kj->pik", R, R[row]))
-    return (turn < limit) & (jnp.sqrt(jnp.sum((t - t[row]) ** 2, axis=-1)) < limit)
+    return (turn < limit) & (
+        jnp.sqrt(jnp.sum((t - t[row][None]) ** 2, axis=-1)) < limit
+    )

@@ -33,7 +33,7 @@ def distinct_modes(
         first = jnp.where(jnp.any(first), first, free)
         best = jnp.argmin(jnp.where(first, particles.energy, jnp.inf))
         turn = lie.rotation_angle(jnp.einsum("pij,kj->pik", R, R[best]))
-        shift = jnp.sqrt(jnp.sum((t - t[best]) ** 2, axis=-1))
+        shift = jnp.sqrt(jnp.sum((t - t[best][None]) ** 2, axis=-1))
         same = free & (turn < angle) & (shift < distance)
         # A mode in use has a weight, though that of its particles may underflow.
         tiny = jnp.finfo(weight.dtype).tiny
@@ -51,7 +51,7 @@ def first_within(
     """The first row within `angle` (radians) and `distance` of each; itself if none."""
     R, t = lie.rotation(T), lie.translation(T)
     turn = lie.rotation_angle(jnp.einsum("pij,qkj->pqik", R, R))
-    shift = jnp.sqrt(jnp.sum((t[:, None] - t) ** 2, axis=-1))
+    shift = jnp.sqrt(jnp.sum((t[:, None] - t[None]) ** 2, axis=-1))
     # Of NaN nothing is within reach, not even itself.
     near = (turn < angle) & (shift < distance) | jnp.eye(len(T), dtype=bool)
     return jnp.argmax(near, axis=1).astype(jnp.int32)

@@ -37,7 +37,7 @@ def refined(
         T = _of_used(lambda T: optimiser.repeat(problem, T, widths), T, used)
     T = lie.orthonormalise(T)
     sound = used & jnp.all(jnp.isfinite(T), axis=(1, 2))
-    eye = lie.identity(T.shape[-1] - 1, T.dtype)
+    eye = lie.identity(T.shape[-1] - 1, T.dtype, (1,))
     return jnp.where(sound[:, None, None], T, eye), sound
 
 

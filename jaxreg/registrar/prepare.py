@@ -44,7 +44,10 @@ def prepare_pair(method: AbstractRegistrar, pair: tuple[Array, ...]) -> Prepared
     method = method.in_frames(frames)
     clouds = on_both(
         lambda cloud: method.prepare(*cloud),
-        *(((side.points - side.mean) / frames.radius, side.mask) for side in sides),
+        *(
+            ((side.points - side.mean[None]) / frames.radius, side.mask)
+            for side in sides
+        ),
     )
     source_cloud, target_cloud = (cloud.followed() for cloud in clouds)
     return PreparedPair(

@@ -82,7 +82,7 @@ def _in_input_frames(
             modes.overlap,
             frames.radius * modes.inlier_rmse,
             modes.log_evidence,
-            modes.covariance * jnp.outer(unit, unit),
+            modes.covariance * jnp.outer(unit, unit)[None],
         ),
         trace=trace,
     )

@@ -26,8 +26,8 @@ from jaxreg.batching.devices import chosen_devices
 from jaxreg.batching.padding import (
     check_lists,
     is_list_of_clouds,
+    lengthened,
     rounded_up,
-    stacked,
 )
 from jaxreg.local import ICP
 from jaxreg.particle import ParticleFilter
@@ -219,7 +219,7 @@ def _rounded_up(pair: tuple[Array, ...]) -> tuple[Array, ...]:
     """With masked rows added to concrete arrays, so that few sizes compile."""
     if not all(map(is_concrete, pair)):
         return pair
-    return tuple(stacked([x], rounded_up(len(x)))[0] for x in pair)
+    return tuple(lengthened(x, rounded_up(len(x))) for x in pair)
 
 
 @kept_program

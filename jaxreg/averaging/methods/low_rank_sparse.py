@@ -161,7 +161,7 @@ def _blocks(
     X = X.at[i, j].add(w * T).at[j, i].add(w * lie.inverse(T))
     X = X / jnp.where(total > 0, total, 1)[..., None, None]
     own, held = jnp.arange(num), jnp.any(total > 0, axis=1)
-    eye = jnp.where(held[:, None, None], jnp.eye(D, dtype=w.dtype), 0)
+    eye = jnp.where(held[:, None, None], jnp.eye(D, dtype=w.dtype)[None], 0)
     X = X.at[own, own].set(eye)
     seen = (total > 0).at[own, own].set(held)
     return X.transpose(0, 2, 1, 3).reshape(num * D, num * D), seen

@@ -144,7 +144,7 @@ class _Search(AbstractIteration[Key | None, _Best]):
         each = odds[jnp.arange(self.hypotheses) % odds.shape[0]]
         each = jnp.exp(heat * noise[0]) * each + 2 * heat * noise[1]
         # What contradicts the best poses loses nothing: chains of them drift.
-        each = each + jax.nn.softplus(explained(graph, best.T).log_odds)
+        each = each + jax.nn.softplus(explained(graph, best.T).log_odds)[None]
         T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(each)
         T = jnp.concatenate([best.T[None], T])
         if graph.num_poses <= DENSE_LIMIT:

@@ -74,7 +74,7 @@ def edge_log_odds(graph: PoseGraph) -> Float[Array, "s e"]:
         return control.fori_loop(0, ROUNDS, gather, prior)
 
     odds = jax.vmap(at_scale)(jnp.asarray(NEUTRAL, prior.dtype))
-    return jnp.where(present, odds, -jnp.inf)
+    return jnp.where(present[None], odds, -jnp.inf)
 
 
 def _cycles(graph: PoseGraph) -> tuple[Array, Array, Array, Array]:

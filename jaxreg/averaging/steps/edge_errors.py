@@ -59,7 +59,7 @@ class LogError(AbstractEdgeError):
         k = lie.tangent_dim(graph.dim)
         info = graph.information
         if info is None:
-            info = jnp.eye(k, dtype=graph.weight.dtype)
+            info = jnp.eye(k, dtype=graph.weight.dtype)[None]
         return graph.weight[:, None, None] * info
 
 

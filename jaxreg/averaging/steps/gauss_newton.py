@@ -81,7 +81,8 @@ def precisions(
         return w * graph.information
     d, k = graph.dim, lie.tangent_dim(graph.dim)
     shift = jnp.full((d,), (width[1] / width[0]) ** 2)
-    return w * jnp.diag(jnp.concatenate([shift, jnp.ones((k - d,), shift.dtype)]))
+    parts = jnp.concatenate([shift, jnp.ones((k - d,), shift.dtype)])
+    return w * jnp.diag(parts)[None]
 
 
 def gauss_newton_step(

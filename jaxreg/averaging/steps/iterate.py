@@ -68,7 +68,7 @@ def nearby_rotation(T: Float[Array, "*b D D"]) -> Float[Array, "*b D D"]:
     """One Newton step back onto SE(d), exact to second order in the departure."""
     R = lie.rotation(T)
     gram = product(jnp.swapaxes(R, -1, -2), R)
-    eye = jnp.eye(R.shape[-1], dtype=R.dtype)
+    eye = jnp.broadcast_to(jnp.eye(R.shape[-1], dtype=R.dtype), R.shape)
     return lie.compose(product(R, 1.5 * eye - 0.5 * gram), lie.translation(T))
 
 
@@ -215,7 +215,9 @@ def pose_change(T_old: Array, T_new: Array, scale: Array) -> Array:
     """The largest rotation (radians) or shift (over the size of the scene)."""
     t_old, t_new = lie.translation(T_old), lie.translation(T_new)
     spread = jnp.sqrt(
-        jnp.mean(jnp.sum((t_new - jnp.mean(t_new, axis=0)) ** 2, axis=-1))
+        jnp.mean(
+            jnp.sum((t_new - jnp.mean(t_new, axis=0, keepdims=True)) ** 2, axis=-1)
+        )
     )
     turn = jnp.sqrt(jnp.sum((lie.rotation(T_new) - lie.rotation(T_old)) ** 2, (-2, -1)))
     shift = jnp.sqrt(jnp.sum((t_new - t_old) ** 2, axis=-1)) / (scale + spread)

@@ -76,6 +76,8 @@ def _followed_width_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     target, change = eqx.filter_jvp(
         lambda g, T: _three_deviations(g, T, width, scale), primals[1:3], tangents[1:3]
     )
+    if change is None:  # information alone: it moves widths by the poses only
+        return width, jnp.zeros_like(width)
     by_width = jax.jacfwd(lambda w: _three_deviations(graph, T_world_i, w, scale))
     settled = jnp.abs(target - width) < STILL * width
     slope = jnp.where(settled[:, None], by_width(width), 0)

@@ -282,4 +282,4 @@ def _tangents(
         x, _, stats = ours.compute(state, rhs, {})
         rounds = stats["num_steps"]
     # Damping leaves pose 0 some of the motion that all share.
-    return jnp.where(held[:, None], x[..., 0] - x[0, :, 0], 0), rounds
+    return jnp.where(held[:, None], x[..., 0] - x[:1, :, 0], 0), rounds

@@ -38,5 +38,7 @@ class ClosedForm(AbstractStep):
         rx = moments.xr.T / total - jnp.outer(r, x)
         turn = nearest_rotation(xx + rx)
         R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
-        T = lie.compose(full_matmul(turn, R), x + t + r - jnp.sum(turn * x, axis=1))
+        T = lie.compose(
+            full_matmul(turn, R), x + t + r - jnp.sum(turn * x[None], axis=1)
+        )
         return jnp.where(moments.total > 0, T, T_target_source)

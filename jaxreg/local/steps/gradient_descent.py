@@ -31,7 +31,7 @@ class GradientDescent(AbstractStep):
         H, b = residual.normal_equations(match, weight)
         scaled = Scaled.of(H, b, match, weight)
         b = scaled.b
-        curvature = jnp.sum(scaled.H * b[:, None] * b)
+        curvature = jnp.sum(scaled.H * b[:, None] * b[None])
         curved = curvature > 0
         length = jnp.sum(b * b) / jnp.where(curved, curvature, 1)
         tangent = jnp.where(curved, length * scaled.unit * b, 0)

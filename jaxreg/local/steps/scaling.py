@@ -46,7 +46,8 @@ class Scaled(eqx.Module):
             [jnp.ones(d, H.dtype), jnp.broadcast_to(turn, (b.shape[0] - d,))]
         )
         scale = jnp.where(stiffness > 0, 1 / jnp.where(stiffness > 0, stiffness, 1), 0)
-        return cls(scale * H * unit[:, None] * unit, scale * b * unit, unit, scale)
+        both = scale * H * unit[:, None] * unit[None]
+        return cls(both, scale * b * unit, unit, scale)
 
     def solve(self, damping: Float[Array, ""] | float) -> Float[Array, " k"]:
         """The tangent (v, w) that solves (H + damping I) x = b.
@@ -94,7 +95,7 @@ def condition(
     r = jnp.asarray(radius, H.dtype)
     turn = 1 / jnp.where(r > 0, r, 1)
     unit = jnp.where(jnp.arange(H.shape[0]) < d, 1, turn)
-    scaled = H * unit[:, None] * unit
+    scaled = H * unit[:, None] * unit[None]
     finite = jnp.all(jnp.isfinite(scaled))
     value = eigh(jnp.where(finite, scaled, 0))[0]
     good = finite & (value[-1] > 0)

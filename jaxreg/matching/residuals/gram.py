@@ -36,7 +36,7 @@ def weighted_gram(
     rows: Float[Array, "r n"], weight: Float[Array, " n"]
 ) -> Float[Array, "r r"]:
     """Rows diag(weight) rows^T in full precision on every device."""
-    return jnp.matmul(rows * weight, rows.T, precision=lax.Precision.HIGHEST)
+    return jnp.matmul(rows * weight[None], rows.T, precision=lax.Precision.HIGHEST)
 
 
 def cross(a: Float[Array, "d n"], b: Float[Array, "d n"]) -> list[Float[Array, " n"]]:

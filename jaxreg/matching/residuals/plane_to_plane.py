@@ -57,7 +57,7 @@ class PlaneToPlane(AbstractResidual):
         out = PointToPoint().descents(match) / 2
         for direction, stiffness in self._axes(match):
             rows = along(direction, match)
-            out = out + stiffness * rows[:-1] * rows[-1]
+            out = out + stiffness[None] * rows[:-1] * rows[-1:]
         return out
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
@@ -70,8 +70,8 @@ class PlaneToPlane(AbstractResidual):
     def _axes(self, match: Match) -> list[tuple[Array, Array]]:
         """Directions s and a, and c / (4 l) of each."""
         p, q = match.source_normal, match.normal
-        p = jnp.where(jnp.any(p != 0, axis=0), p, q)
-        q = jnp.where(jnp.any(q != 0, axis=0), q, p)
+        p = jnp.where(jnp.any(p != 0, axis=0, keepdims=True), p, q)
+        q = jnp.where(jnp.any(q != 0, axis=0, keepdims=True), q, p)
         c = 1 - jnp.asarray(self.epsilon, q.dtype)
         cosine = sum_rows(p * q)
         return [

@@ -44,7 +44,7 @@ class PointToPlane(AbstractResidual):
         """Rows (n, x cross n) times n . r, plus the share of points."""
         rows = along(match.normal, match)
         share = jnp.asarray(self.point_share, rows.dtype)
-        return rows[:-1] * rows[-1] + share * PointToPoint().descents(match)
+        return rows[:-1] * rows[-1:] + share * PointToPoint().descents(match)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w ((n . r)^2 + point_share |r|^2) / 2."""

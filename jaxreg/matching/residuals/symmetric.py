@@ -40,7 +40,7 @@ class Symmetric(AbstractResidual):
     def descents(self, match: Match) -> Float[Array, "k n"]:
         """Rows (n, x cross n + r cross n_p) times n . r."""
         rows = _rows(match)
-        return rows[:-1] * rows[-1]
+        return rows[:-1] * rows[-1:]
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w ((n_p + n_q) . r)^2 / 2."""
@@ -57,7 +57,8 @@ def _rows(match: Match) -> Float[Array, "k1 n"]:
 def _source_normal(match: Match) -> Float[Array, "d n"]:
     """The source normals at the present pose, with the sign nearer to the target's."""
     sign = jnp.where(sum_rows(match.source_normal * match.normal) < 0, -1, 1)
-    return sign.astype(match.normal.dtype) * rotate(match.turn, match.source_normal)
+    sign = sign.astype(match.normal.dtype)[None]
+    return sign * rotate(match.turn, match.source_normal)
 
 
 def _normal_sum(match: Match) -> Float[Array, "d n"]:

@@ -92,4 +92,4 @@ class PathSpread(AbstractSpread):
 def _root(S: Float[Array, "k k"]) -> Float[Array, "k k"]:
     """L with L L^T = S; singular where the errors span less."""
     value, vector = eigh(S)
-    return vector * jnp.sqrt(jnp.maximum(value, 0))
+    return vector * jnp.sqrt(jnp.maximum(value, 0))[None]

@@ -55,7 +55,7 @@ class GaussianPrior(AbstractPrior):
         init = lie.identity(d, dtype) if init is None else init
         translates = jnp.arange(k) < d
         spread = jnp.where(translates, self.translation_spread, self.rotation_spread)
-        tangent = spread.astype(dtype) * jax.random.normal(key, (num, k), dtype)
+        tangent = spread.astype(dtype)[None] * jax.random.normal(key, (num, k), dtype)
         return jax.vmap(turn_and_shift, (None, 0))(init, tangent.at[0].set(0))
 
     def log_density(self, T_target_source: Motion) -> Scalar:

@@ -115,7 +115,7 @@ class PartialPose(AbstractPrior):
                 place = jnp.einsum("pij,pj->pi", turn, place)
             place = place + self.deviation * noise
             if self.target_scanner is not None:
-                place = place + self.target_scanner
+                place = place + self.target_scanner[None]
             if self.source_scanner is not None:
                 place = place - R @ self.source_scanner
             T = lie.compose(R, place)
@@ -158,8 +158,8 @@ class PartialPose(AbstractPrior):
         up = _unit(self.up)
         angle = jax.random.uniform(key_turn, (num, 1), dtype, -jnp.pi, jnp.pi)
         tilt = self.tilt * jax.random.normal(key_tilt, (num, 3), dtype)
-        tilt = tilt - (tilt @ up)[:, None] * up
-        return lie.rotation_exp(tilt) @ lie.rotation_exp(angle * up)
+        tilt = tilt - (tilt @ up)[:, None] * up[None]
+        return lie.rotation_exp(tilt) @ lie.rotation_exp(angle * up[None])
 
     def _deviations(
         self, place: Float[Array, " d"], known: Float[Array, " d"]

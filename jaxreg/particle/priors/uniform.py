@@ -42,7 +42,7 @@ class UniformPrior(AbstractPrior):
         key_R, key_t = jax.random.split(key)
         R = lie.random_rotations(key_R, num, d, dtype)
         t = self.translation_spread * jax.random.normal(key_t, (num, d), dtype)
-        return lie.compose(R, t if init is None else t + lie.translation(init))
+        return lie.compose(R, t if init is None else t + lie.translation(init)[None])
 
     def log_density(self, T_target_source: Motion) -> Scalar:
         """Zero: it only says where to begin."""

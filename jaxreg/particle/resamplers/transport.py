@@ -121,7 +121,7 @@ def _plan(
     def shares(f: Array, eps: Array) -> Array:
         """Logarithms; whatever f is, columns are served in full."""
         level = log_weight[:, None] + (f[:, None] - cost) / eps
-        return level - jax.nn.logsumexp(level, axis=0)
+        return level - jax.nn.logsumexp(level, axis=0, keepdims=True)
 
     @jax.checkpoint
     def sweep(f: Array, eps: Array) -> tuple[Array, None]:
