@@ -1,4 +1,4 @@
-"""Refinement: every overlapping pair is measured again, from the poses of all.
+"""Refinement: pairs that overlap are measured again, from the poses of all.
 
 The MCC paper's chain, pairs then averaging, closed into a loop: poses from the average
 say which scans overlap and how they lie; from there the motion of each such pair is
@@ -44,7 +44,7 @@ def refine(
     least: Scalar,
     pairs: Int[Array, "p 2"],
 ) -> tuple[Placement, RelativeMotions]:
-    """Poses from all pairs of placed scans that overlap, measured anew.
+    """Poses from pairs of placed scans that overlap, measured anew.
 
     They have derivatives by the points of the scans: of the last round, which matches
     are held in.

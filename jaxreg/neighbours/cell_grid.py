@@ -208,7 +208,8 @@ def _grid(
     widest = jnp.max(extent) / (_resolution(m, d) - 2)
     width = jnp.maximum(width, 1e-6 * widest)
     width = jnp.where(width > 0, width, 1)  # not for NaN either, where none is valid
-    widths = width * jnp.maximum(widest / width, 1) ** jnp.linspace(0, 1, _WIDTHS)
+    steps = jnp.linspace(0, 1, _WIDTHS, dtype=points.dtype)
+    widths = width * jnp.maximum(widest / width, 1) ** steps
     sizes = jnp.floor(extent[None] / widths[:, None]) + 2
     fits = jnp.prod(sizes, axis=1) <= num_cells
     row = jnp.where(jnp.any(fits), jnp.argmax(fits), _WIDTHS - 1)

@@ -25,13 +25,13 @@ class Pair(eqx.Module):
     @property
     def exact(self) -> "ExactPair":
         """With indexes that miss no near point; tables miss every other."""
-        source_index, target_index = on_both(
+        indexes = on_both(
             lambda cloud: index_within(
                 cloud.points, cloud.mask, median_spacing(cloud.points, cloud.mask)
             ),
             *levelled(self.source, self.target),
         )
-        return ExactPair(self.source, self.target, target_index, source_index)
+        return ExactPair(self.source, self.target, *indexes)
 
     @property
     def judged(self) -> "Pair":
@@ -52,10 +52,18 @@ class Pair(eqx.Module):
         )
 
 
-class ExactPair(Pair):
+class ExactPair(eqx.Module):
     """Two clouds with indexes that miss no near point, in either direction."""
 
+    source: PointCloud
+    target: PointCloud
     source_index: AbstractIndex
+    target_index: AbstractIndex
+
+    @property
+    def problem(self) -> Problem:
+        """The source to be registered to the target, all points."""
+        return Problem.of(self.source, self.target, self.target_index)
 
     @property
     def witness(self) -> Witness:

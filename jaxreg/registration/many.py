@@ -62,8 +62,8 @@ def register_batch(
 
     def of_rows(rows: np.ndarray) -> _Pairs:
         if len(rows) == num:
-            return jax.device_put(every)
-        return jax.tree.map(lambda x: jax.device_put(x[rows]), every)
+            return jax.tree.map(_on_device, every)
+        return jax.tree.map(lambda x: _on_device(x[rows]), every)
 
     group = np.arange(num), of_rows
     how = impl, threads, batch_size, progress, devices
@@ -97,7 +97,7 @@ def register_lists(
                 stacked([targets[i] for i in rows], m),
                 stacked([source_masks[i] for i in rows], n),
                 stacked([target_masks[i] for i in rows], m),
-                *jax.tree.map(lambda x: jax.device_put(x[rows]), each),
+                *jax.tree.map(lambda x: _on_device(x[rows]), each),
             )
 
         return members, of_rows
@@ -159,10 +159,15 @@ def _register_groups(
             done += len(part.status)
             tell(progress, _STAGE, done, total, part)
     if len(parts) == 1:
-        return jax.device_put(parts[0])
+        return jax.tree.map(_on_device, parts[0])
     order = np.argsort(np.concatenate([members for members, _ in groups]))
     xp = np if threads else jnp
-    return jax.tree.map(lambda *x: jax.device_put(xp.concatenate(x)[order]), *parts)
+    return jax.tree.map(lambda *x: _on_device(xp.concatenate(x)[order]), *parts)
+
+
+def _on_device(x: Array | np.ndarray) -> Array:
+    """Where it is, of several hosts, too; or moved there in so many words."""
+    return x if isinstance(x, jax.Array) else jax.device_put(x)
 
 
 def _over_cores(
