@@ -25,8 +25,8 @@ ALL_UP_TO, _PAIRS_PER_SCAN = 20, 10
 _IN_ORDER, _AT_RANDOM = 2, 3
 # Tries of a part that is not joined, a scan and round.
 _TRIES = 3
-# A scan is safe by so many trusted pairs; a loop has so many pairs or more.
-_SAFE, _LOOP = 3, 4
+#: A scan is safe by so many trusted pairs; a loop has so many pairs or more.
+SAFE, _LOOP = 3, 4
 #: Scans are taken to overlap by the poses from this share on.
 LIKELY = 0.2
 
@@ -89,7 +89,7 @@ def next_pairs(
     overlap = np.where(open_ & (likely >= LIKELY), likely, 0)
     hops = shortest_path(trusted, unweighted=True)
     loop = np.where(hops >= _LOOP, overlap * np.minimum(hops, num), 0)
-    weak = np.sum(trusted, axis=1) < _SAFE
+    weak = np.sum(trusted, axis=1) < SAFE
     for i in np.flatnonzero(part == largest):
         for worth in (loop[i], overlap[i] * weak[i]):
             if worth.max() > 0:

@@ -12,7 +12,13 @@ from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.threads import map_in_threads
 from jaxreg.geometry import lie
-from jaxreg.multiview.choose_pairs import Order, first_pairs, most_pairs, next_pairs
+from jaxreg.multiview.choose_pairs import (
+    SAFE,
+    Order,
+    first_pairs,
+    most_pairs,
+    next_pairs,
+)
 from jaxreg.multiview.follow_sequence import (
     SURE,
     descended,
@@ -90,7 +96,7 @@ class Rounds:
             pairs = next_pairs(self.tried, trusted, likely, part, rng)
             pairs = pairs[: self.most - self.num_tried]
             if order == "sequential":
-                self._close_loops(pairs, placement)
+                self._close_loops(pairs, placement, trusted)
         return RelativeMotions.joined(self.found)
 
     @property
@@ -156,13 +162,17 @@ class Rounds:
                 step = sure[i, j] = np.asarray(one.in_input_frames(scans).T_i_j[0, 0])
         self.report("following the sequence", len(gaps), len(gaps))
 
-    def _close_loops(self, pairs: np.ndarray, placement: Placement) -> None:
+    def _close_loops(
+        self, pairs: np.ndarray, placement: Placement, trusted: np.ndarray
+    ) -> None:
         """Pairs of a sequence by descents from the present poses.
 
         Where these poses are wrong, what they bring together is no surface twice. A
-        descent is one try, where a search has hundreds: it is believed as an answer is.
+        descent is one try, where a search has hundreds: of scans that others hold it is
+        believed as an answer is. Scans that hang by few pairs need the best there is.
         """
-        part = np.asarray(placement.part)
+        part, held = np.asarray(placement.part), np.sum(trusted, axis=1) >= SAFE
+        likely = float(min_log_evidence(self.method))
         T = placement.T_world_i
         for done, (i, j) in enumerate(pairs.tolist()):
             if part[i] != part[j] or self._is_known((i, j)):
@@ -171,7 +181,7 @@ class Rounds:
             pair = jax.device_put(np.array([(i, j)], np.int32))
             T_i_j = lie.between(T[i], T[j])
             one = descended(self.method, self.scans, pair, T_i_j[None])
-            self._keep(one, float(min_log_evidence(self.method)))
+            self._keep(one, likely if held[i] and held[j] else SURE)
 
     def _is_known(self, pair: tuple[int, int]) -> bool:
         return pair in self.row or pair in self.sure
