@@ -50,6 +50,11 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         metavar="DIR",
         help="real scans and graphs (default: JAXREG_DATA, else ../shared/data)",
     )
+    add(
+        "--accelerator",
+        action="store_true",
+        help="rows of an accelerator alone, where one is lent by the minute",
+    )
     add("--resume", action="store_true", help="go on with what --out holds")
     add(
         "--gate",
@@ -83,7 +88,13 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse(arguments)
     names = options.only or list(WORKLOADS)
     settings = Settings(
-        names, options.quick, options.peers, options.out, options.data, options.resume
+        names,
+        options.quick,
+        options.peers,
+        options.out,
+        options.data,
+        options.resume,
+        options.accelerator,
     )
     if not options.quick and not options.data.is_dir():
         print(f"no data in {options.data}: workloads on generated data only")

@@ -44,6 +44,7 @@ class Settings(NamedTuple):
     out: Path
     data: Path
     resume: bool
+    accelerator: bool = False
     longest_call: float = LONGEST_CALL
 
     @property
@@ -118,6 +119,7 @@ def _begin(settings: Settings) -> str:
 def _command(settings: Settings) -> str:
     """What repeats it; folders are the caller's own."""
     words = ["python", "-m", "bench"] + ["--quick"] * settings.quick
+    words += ["--accelerator"] * settings.accelerator
     if settings.workloads != list(WORKLOADS):
         words += ["--only", *settings.workloads]
     if settings.peers is not None:
@@ -156,6 +158,7 @@ def _measure(
             "resume": settings.resume,
             "run": run_name,
             "cores": cores,
+            "accelerator": settings.accelerator,
             "running": str(running),
         }
         command = [sys.executable, "-m", "bench.worker", json.dumps(task)]

@@ -31,13 +31,14 @@ def main(task: dict[str, Any]) -> None:
     mode = "quick" if task["quick"] else "full"
     case = None
     for case in module.cases(Options(task["quick"], Path(task["data"]))):
-        case = _on_accelerators(case)
+        case = _on_accelerators(case, alone=task["accelerator"])
         blank = blank_row(
             mode, task["workload"], case.name, task["run"], len(task["cores"])
         )
         methods = wanted(case, task["peers"], done, blank)
         if not methods:
-            print(f"{task['workload']:18.18s} {case.name}: finished before")
+            why = "finished before" if case.methods else "no accelerator runs it"
+            print(f"{task['workload']:18.18s} {case.name}: {why}")
             continue
 
         def before(name: str, case: Case = case) -> None:
@@ -78,15 +79,18 @@ def wanted(case: Case, peers: list[str] | None, done: dict[Key, Row], blank: Any
     return [m for m in chosen if m.name not in failed]
 
 
-def _on_accelerators(case: Case) -> Case:
-    """The case with a second row on the accelerator of what can be put there."""
+def _on_accelerators(case: Case, *, alone: bool) -> Case:
+    """The case with a second row on the accelerator of what can be put there.
+
+    Or with those rows alone.
+    """
     # Not before the process is pinned.
     import jax
 
     try:
         device = jax.devices("gpu")[0]
     except RuntimeError:
-        return case
+        return replace(case, methods=[]) if alone else case
     jax.config.update("jax_default_device", jax.devices("cpu")[0])
 
     def there(method: Method) -> Method:
@@ -99,7 +103,7 @@ def _on_accelerators(case: Case) -> Case:
         return replace(method, name=name, solve=solve)
 
     more = [there(m) for m in case.methods if m.on_accelerator]
-    return replace(case, methods=[*case.methods, *more])
+    return replace(case, methods=more if alone else [*case.methods, *more])
 
 
 def summary(row: Row) -> str:

@@ -5,6 +5,7 @@ is counted and told with it, so that its rate can be held against the device's f
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,26 +14,33 @@ import jax.numpy as jnp
 import numpy as np
 
 from bench.case import Case, Judged, Method, Options
-from bench.records import Metric
+from bench.peers.global_pairs import Features
+from bench.records import Metric, share
 from bench.workloads.averaging_batch import judge as judge_averaged
 from bench.workloads.averaging_data import H, N, batch_of, small_graph
 from bench.workloads.filter_data import horse, horse_model, horse_name
 from bench.workloads.filter_methods import look_ups
 from bench.workloads.global_horse import judge as judge_horse
+from bench.workloads.global_scans import BELIEVED
 from bench.workloads.local_pairs import written_out
 from bench.workloads.neighbours import queries_off, sculpture_points
 from bench.workloads.prepared_model import ours
-from jaxreg import register
+from bench.workloads.sensor_data import Answer, SensorPair, sensor_pairs
+from jaxreg import ParticleFilter, Status, register
 from jaxreg.averaging import average
 from jaxreg.neighbours import BruteForce
 
 
 HORSES, GRAPHS, TARGETS, QUERIES = 200, 64, 10_000, 16_384
+POINTS = 16_384  # of each scan
+_ENDS = "source", "target"
 
 
 def cases(options: Options) -> Iterator[Case]:
     """Pairs, particles, closest points and graphs a second."""
     yield _horses(options)
+    if pairs := [p for p in sensor_pairs(options.data) if _fits(p)]:
+        yield _scans(pairs)
     yield _closest()
     yield _graphs()
 
@@ -70,6 +78,59 @@ def _horses(options: Options) -> Case:
         HORSES,
         "pairs",
         lambda x: judge_horse(trials, list(x[0])),
+    )
+
+
+def _fits(pair: SensorPair) -> bool:
+    return min(len(pair.source), len(pair.target)) >= POINTS
+
+
+def _scans(pairs: list[SensorPair]) -> Case:
+    """Scans of sensors, thinned at random to one size."""
+    rng = np.random.default_rng(0)
+
+    def some(points: np.ndarray) -> np.ndarray:
+        return points[rng.choice(len(points), POINTS, replace=False)]
+
+    thinned = [p._replace(source=some(p.source), target=some(p.target)) for p in pairs]
+    source, target = (np.stack([getattr(p, end) for p in thinned]) for end in _ENDS)
+
+    def solve() -> list[Answer]:
+        found = register(source, target, key=jax.random.key(0))
+        T = np.asarray(found.T_target_source, float)
+        believed = np.asarray(found.status) == Status.CONVERGED
+        return [Answer(T[k], bool(believed[k])) for k in range(len(T))]
+
+    def by_features() -> list[Answer]:
+        return [_by_open3d(pair) for pair in thinned]
+
+    text = written_out(ParticleFilter())
+    own = Method("jaxreg register", "jaxreg", text, solve, on_accelerator=True)
+    peer = Method("Open3D RANSAC, FPFH", "open3d", "voxels of the data", by_features)
+    name = f"{len(pairs)} pairs of scans, {POINTS} points, in one call"
+    case = _case(
+        name, "sensor_pairs", own, len(pairs), "pairs", lambda x: _judge(thinned, x[0])
+    )
+    return replace(case, methods=[own, peer])
+
+
+def _by_open3d(pair: SensorPair) -> Answer:
+    peer = Features("RANSAC", pair.voxel, camera_at_origin=pair.camera_at_origin)
+    T, score = peer.solve(peer.prepare(pair.source), peer.prepare(pair.target), 0)
+    return Answer(T, score > BELIEVED)
+
+
+def _judge(pairs: list[SensorPair], answers: list[Answer]) -> Judged:
+    both = list(zip(pairs, answers, strict=True))
+    right = np.array([pair.right(a.T_target_source) for pair, a in both])
+    believed = np.array([a.believed for a in answers])
+    wrong = float(np.sum(believed & ~right))
+    return Judged(
+        [
+            share("right", right, 1.0),
+            share("right and believed", right & believed, 1.0),
+            Metric("wrong and believed", wrong, "", "down", 0.0),
+        ]
     )
 
 

@@ -1,7 +1,7 @@
 """Fields of method objects, traced numbers and static structure; rows of arrays."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from jaxreg._core.checks import TRACED
+from jaxreg._core.platforms import by_platform
 
 
 Tree = TypeVar("Tree")
@@ -79,5 +80,17 @@ def spread_rows(
     at, used = jnp.arange(num, dtype=jnp.int32), jnp.minimum(count[-1], num)
     # The valid row of that rank; searched, not sorted.
     rank = at * (count[-1] - 1) // jnp.maximum(used - 1, 1)
-    row = jnp.searchsorted(count, rank + 1).astype(jnp.int32)
+    row = place_among(count, rank + 1)
     return jnp.minimum(row, len(mask) - 1), at < used
+
+
+def place_among(
+    ascending: Array, wanted: Array, side: Literal["left", "right"] = "left"
+) -> Array:
+    """`jnp.searchsorted`: by halves on a CPU, by one sort on an accelerator."""
+
+    def by(method: str) -> Array:
+        found = jnp.searchsorted(ascending, wanted, side=side, method=method)
+        return found.astype(jnp.int32)
+
+    return by_platform(lambda: by("scan"), lambda: by("sort"))

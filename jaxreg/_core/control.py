@@ -114,6 +114,11 @@ def _typed(function: Callable[Args, Out]) -> Callable[Args, Out]:
     return typed
 
 
+def inside_shard_map() -> bool:
+    """Whether what is traced runs on each of several devices by itself."""
+    return bool(_manual_axes())
+
+
 def _manual_axes() -> tuple[str, ...]:
     """The axes of `shard_map` around this; nothing outside of it."""
     return tuple(jax.sharding.get_abstract_mesh().manual_axes)

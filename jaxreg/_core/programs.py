@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable
 from importlib import metadata
 from importlib.util import find_spec
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
@@ -18,6 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.platforms import platform_of, traced_for
 from jaxreg._core.program_files import Hole, digest, pickled, read, write
 
 
@@ -31,14 +33,18 @@ def kept_program(function: Callable[P, Out]) -> Callable[P, Out]:
     Those of calls from outside of transformations, with arrays of one device and with
     methods of this package: of other code a key cannot tell when it changes.
     """
-    plain = eqx.filter_jit(function)
+    traced = _as_it_is_traced(function)
+    plain = eqx.filter_jit(traced)
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Out:
-        if _STORE is None:
-            return plain(*args, **kwargs)
-        program = _STORE.program(function, args, kwargs)
-        return plain(*args, **kwargs) if program is None else program(args, kwargs)
+        platform = platform_of(args, kwargs)
+        if _STORE is None or platform is None:
+            return plain(platform, args, kwargs)
+        program = _STORE.program(traced, platform, args, kwargs)
+        if program is None:
+            return plain(platform, args, kwargs)
+        return program(args, kwargs)
 
     return call
 
@@ -51,6 +57,23 @@ def keep_programs(folder: Path | None) -> None:
     global _STORE
     able = find_spec("flatbuffers") is not None
     _STORE = _Store(folder) if folder is not None and able else None
+
+
+def _as_it_is_traced(function: Callable[..., Out]) -> Callable[..., Out]:
+    """For one platform, with products of matrices in full precision.
+
+    Poses need all digits of float32; accelerators multiply with 10 bits unless told.
+    """
+
+    @functools.wraps(function)
+    def traced(platform: str | None, args: Any, kwargs: Any) -> Out:
+        with traced_for(platform), jax.default_matmul_precision("highest"):
+            return function(*args, **kwargs)
+
+    # By `wraps` it has the function's names, and would have its arguments.
+    own = (Parameter(x, Parameter.POSITIONAL_ONLY) for x in ("platform", "a", "b"))
+    traced.__signature__ = Signature(list(own))  # pyright: ignore[reportAttributeAccessIssue]
+    return traced
 
 
 class _Program(NamedTuple):
@@ -73,12 +96,15 @@ class _Store:
         self._met: dict[Any, _Program | None] = {}
         self._told = False
 
-    def program(self, function: Callable, args: Any, kwargs: Any) -> _Program | None:
+    def program(
+        self, function: Callable, platform: str, args: Any, kwargs: Any
+    ) -> _Program | None:
         """The program of a call; None if it cannot be kept."""
         arrays, static = eqx.partition((args, kwargs), eqx.is_array)
         leaves, places = jax.tree.flatten(arrays)
-        settings = _settings()
-        if settings is None or not all(map(_is_usual, leaves)):
+        settings = _settings(platform)
+        usual = all(_is_usual(x, platform) for x in leaves)
+        if settings is None or not usual:
             return None
         rest, others = jax.tree.flatten(static)
         holes = tuple(map(_hole, leaves))
@@ -91,11 +117,17 @@ class _Store:
         except TypeError:  # something static has no hash
             return None
         asked = eqx.combine(jax.tree.unflatten(places, holes), static)
-        self._met[key] = self._made(function, asked, args, kwargs, settings)
+        self._met[key] = self._made(function, asked, platform, args, kwargs, settings)
         return self._met[key]
 
     def _made(
-        self, function: Callable, asked: Any, args: Any, kwargs: Any, settings: tuple
+        self,
+        function: Callable,
+        asked: Any,
+        platform: str,
+        args: Any,
+        kwargs: Any,
+        settings: tuple,
     ) -> _Program | None:
         """From the folder, else traced and put there."""
         who = function.__module__, function.__qualname__
@@ -106,7 +138,7 @@ class _Store:
         path = self.folder / f"{name}.program"
         found = read(path)
         if found is None:
-            found = _exported(function, args, kwargs)
+            found = _exported(function, platform, args, kwargs)
             if found is None:
                 return None
             self._write(path, *found)
@@ -131,16 +163,15 @@ def _hole(x: Any) -> Hole:
     return Hole(tuple(x.shape), str(x.dtype), bool(getattr(x, "weak_type", False)))
 
 
-def _is_usual(x: Any) -> bool:
-    """Whether an array is known, and on one device of the kind that is the default."""
+def _is_usual(x: Any, platform: str) -> bool:
+    """Whether an array is known, and on one device of the platform."""
     if not is_concrete(x):
         return False
     devices = x.devices() if isinstance(x, jax.Array) else ()
-    kinds = {device.platform for device in devices}
-    return len(devices) < 2 and kinds <= {jax.default_backend()}
+    return len(devices) < 2 and {d.platform for d in devices} <= {platform}
 
 
-def _settings() -> tuple[str, ...] | None:
+def _settings(platform: str) -> tuple[str, ...] | None:
     """Of JAX, on which a program depends; None where programs are not to be kept."""
     config: Any = jax.config  # its names are made as it runs
     if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs:
@@ -150,7 +181,7 @@ def _settings() -> tuple[str, ...] | None:
         str(config.jax_default_matmul_precision),
         str(config.jax_default_prng_impl),
         str(config.jax_threefry_partitionable),
-        jax.default_backend(),
+        platform,
     )
 
 
@@ -165,7 +196,9 @@ def _code() -> tuple[str, ...]:
     return code, platform.python_version(), *versions
 
 
-def _exported(function: Callable, args: Any, kwargs: Any) -> tuple[Any, Any] | None:
+def _exported(
+    function: Callable, platform: str, args: Any, kwargs: Any
+) -> tuple[Any, Any] | None:
     """The traced program and the skeleton of its answer; None if it cannot be kept."""
     from jax import export
 
@@ -175,7 +208,7 @@ def _exported(function: Callable, args: Any, kwargs: Any) -> tuple[Any, Any] | N
 
     def flat(*leaves: Any) -> list[Any]:
         args, kwargs = eqx.combine(jax.tree.unflatten(places, leaves), static)
-        arrays, rest = eqx.partition(function(*args, **kwargs), eqx.is_array)
+        arrays, rest = eqx.partition(function(platform, args, kwargs), eqx.is_array)
         skeletons.append(eqx.combine(jax.tree.map(lambda _: Hole(), arrays), rest))
         return jax.tree.leaves(arrays)
 

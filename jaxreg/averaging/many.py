@@ -17,6 +17,7 @@ from jaxreg.averaging.gauge import average_graph
 from jaxreg.batching.devices import Devices, map_rows, spread_rows
 from jaxreg.batching.padding import rounded_up, stacked
 from jaxreg.batching.progress import tell
+from jaxreg.batching.side_by_side import side_by_side
 from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
 
 
@@ -47,7 +48,7 @@ def average_list(
     method: AbstractAverager,
     init: object,
     key: Key | None,
-    batch_size: int,
+    batch_size: int | None,
     progress: Progress | None,
     devices: Devices | None,
 ) -> list[AveragingSolution]:
@@ -64,7 +65,8 @@ def average_list(
         lanes = _padded(some, starts, *padded_to)
         own_keys = None if keys is None else keys[rows]
         lanes = spread_rows(devices, (*lanes, own_keys))
-        found = _average_lanes(method, lanes, batch_size, devices)
+        at_once = side_by_side(batch_size, padded_to[1], lanes)
+        found = _average_lanes(method, lanes, at_once, devices)
         if is_concrete(found.status):
             found = jax.tree.map(np.asarray, found)  # slices compile nothing
         out |= {k: _cut(found, lane, checked[k]) for lane, k in enumerate(rows)}
@@ -77,7 +79,7 @@ def average_batch(
     method: AbstractAverager,
     init: object,
     key: Key | None,
-    batch_size: int,
+    batch_size: int | None,
     devices: Devices | None,
 ) -> AveragingSolution:
     """Of graphs of one size, with a leading axis on every array."""
@@ -92,11 +94,12 @@ def average_batch(
         check_rigid(starts, "init")
     keys = None if key is None else jax.random.split(key, num)
     lanes = spread_rows(devices, (graphs, None, starts, keys))
-    return _average_lanes(method, lanes, batch_size, devices)
+    at_once = side_by_side(batch_size, graphs.edges.shape[1], lanes)
+    return _average_lanes(method, lanes, at_once, devices)
 
 
 def _pieces(
-    graphs: list[PoseGraph], batch_size: int
+    graphs: list[PoseGraph], batch_size: int | None
 ) -> Iterator[tuple[np.ndarray, tuple[int, int]]]:
     """Graphs that are averaged in one call, and the poses and edges they get.
 
@@ -106,7 +109,7 @@ def _pieces(
     for num_poses in np.unique(sizes):
         rows = np.flatnonzero(sizes == num_poses)
         num_edges = rounded_up(max(graphs[k].num_edges for k in rows), 2 * _LEAST)
-        piece = -(-len(rows) // -(-len(rows) // max(_PIECE, batch_size)))
+        piece = -(-len(rows) // -(-len(rows) // max(_PIECE, batch_size or 1)))
         for start in range(0, len(rows), piece):
             first = min(start, len(rows) - piece)
             yield rows[first : first + piece], (int(num_poses), num_edges)
@@ -173,7 +176,8 @@ def _average_lanes(
         return average_graph(graph, method, init, key, present)
 
     # Groups of one would be vectorised over an axis of one: conditions become selects.
-    size = batch_size if batch_size > 1 else None
+    num = len(lanes[0].T_i_j)
+    size = min(batch_size, num) if batch_size > 1 else None
 
     def some(lanes: _Lanes) -> AveragingSolution:
         return lax.map(one, lanes, batch_size=size)

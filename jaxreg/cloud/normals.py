@@ -12,6 +12,7 @@ that answered, which are not searched for again.
 """
 
 import itertools
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -21,6 +22,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.arrays import place_among
+from jaxreg._core.platforms import by_platform
 from jaxreg._core.typing import Scalar
 from jaxreg.cloud.cells import UNUSED, bits_per_axis, morton_keys
 from jaxreg.geometry.eigen import least_eigenvectors
@@ -128,7 +131,6 @@ def _search(
 ) -> tuple[Float[Array, "p d"], Int[Array, " p"]]:
     """The normals, and the levels of the cells that they come from; -1 of none."""
     d, p = points.shape[1], places.shape[0]
-    width = min(_BLOCK, p)
 
     def unfinished(state: tuple[Array, ...]) -> Array:
         level, _, _, done = state
@@ -140,7 +142,7 @@ def _search(
         # Few places need the coarser levels: those without a normal come first.
         rows = rows_in_order(done.astype(jnp.int32), 1)
 
-        def block(b: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        def block(b: Array, state: tuple[Array, ...], width: int) -> tuple[Array, ...]:
             normals, levels, done = state
             at = lax.dynamic_slice_in_dim(rows, b * width, width)
             vectors, spans = _least_spread(places[at], cells, size, level)
@@ -152,8 +154,15 @@ def _search(
                 done.at[at].set(done[at] | spans),
             )
 
-        blocks = -(-jnp.sum(~done) // width)
-        out = control.fori_loop(0, blocks, block, (normals, levels, done))
+        def by_blocks(width: int) -> tuple[Array, ...]:
+            blocks, of_one = -(-jnp.sum(~done) // width), partial(block, width=width)
+            return control.fori_loop(0, blocks, of_one, (normals, levels, done))
+
+        # An accelerator waits for each turn of a loop.
+        out = by_platform(
+            lambda: by_blocks(min(_BLOCK, p)),
+            lambda: block(jnp.zeros((), jnp.int32), (normals, levels, done), p),
+        )
         return level + 1, *out
 
     level, none = jnp.asarray(finest, jnp.int32), jnp.full(p, -1, jnp.int32)
@@ -176,7 +185,7 @@ def _least_spread(
     cell = base.astype(jnp.int32)[None] + corners[:, :, None]  # (2^d, d, p)
     inside = jnp.all((cell >= 0) & (cell <= last), axis=1)
     key = morton_keys(jnp.swapaxes(jnp.clip(cell, 0, last), 0, 1))
-    row = jnp.minimum(jnp.searchsorted(cell_key, key), len(cell_key) - 1)
+    row = jnp.minimum(place_among(cell_key, key), len(cell_key) - 1)
     far, offset = corners[:, :, None] == 1, offset[None]
     weight = jnp.prod(jnp.where(far, offset, 1 - offset), axis=1)
     weight = jnp.where(inside & (cell_key[row] == key), weight, 0)

@@ -11,6 +11,8 @@ Two properties of XLA on CPU shape the code: an integer `min` is vectorised and 
 `min` to a scalar is not, so distances are reduced as the integers of the same bits,
 which order alike; and a value with two users is computed twice unless a loop of two
 or more trips returns it.
+
+An accelerator compares all pairs instead.
 """
 
 from collections.abc import Callable
@@ -20,8 +22,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.platforms import by_platform
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.neighbours.base import AbstractIndex, closest_only, in_tiles, map_first
+from jaxreg.neighbours.brute import BruteForce
 from jaxreg.neighbours.order import hilbert_order
 
 
@@ -38,9 +42,9 @@ class BoxTree(AbstractIndex):
     """Exact search from some thousand to a million targets; O(n + m) memory.
 
     Queries may come in any order: `lookup_nearest` sorts them along the curve, as does
-    `query`; `lookup` is fast
-    where neighbours in memory are neighbours in space (`hilbert_order`), and slower
-    than brute force in random order. Ties go to any of the closest points.
+    `query`; `lookup` is fast where neighbours in memory are neighbours in space
+    (`hilbert_order`), and slower than brute force in random order. Ties go to any of
+    the closest points.
     """
 
     points: Float[Array, "m d"]
@@ -91,13 +95,29 @@ class BoxTree(AbstractIndex):
         coarse: Bool[Array, ""] | None = None,
     ) -> Int[Array, " n"]:
         """A closest valid target of each query."""
+        return by_platform(
+            lambda: self._lookup(columns, num),
+            lambda: BruteForce(self.points, self.mask).lookup(columns, num),
+        )
+
+    def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
+        """The k closest valid targets of each query; -1 for surplus."""
+        return by_platform(
+            lambda: self._lookup_nearest(columns, k),
+            lambda: BruteForce(self.points, self.mask).lookup_nearest(columns, k),
+        )
+
+    def _lookup(
+        self, columns: Float[Array, "d n"], num: Int[Array, ""] | None
+    ) -> Int[Array, " n"]:
         n = columns.shape[1]
         tiles = self._tiles(columns)
         leaf = map_first(self._leaf_of_tile, tiles, num).reshape(-1)[:n]
         return self._row_in_leaf(lax.stop_gradient(columns), leaf)
 
-    def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
-        """The k closest valid targets of each query; -1 for surplus."""
+    def _lookup_nearest(
+        self, columns: Float[Array, "d n"], k: int
+    ) -> Int[Array, "k n"]:
         n = columns.shape[1]
         columns = lax.stop_gradient(columns)
         order = hilbert_order(jnp.nan_to_num(columns.T), jnp.ones(n, bool))

@@ -23,7 +23,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.platforms import by_platform
 from jaxreg._core.typing import Mask, Points, Scalar
+from jaxreg.neighbours import all_pairs
 from jaxreg.neighbours.base import AbstractIndex, closest_only, map_first
 
 
@@ -67,47 +69,77 @@ class BruteForce(AbstractIndex):
         coarse: Bool[Array, ""] | None = None,
     ) -> Int[Array, " n"]:
         """The closest valid target of each query, exactly."""
-        groups, scale = self._groups()
-        # Less padding than rounding the number of groups up to a whole tile.
-        tiles = -(-len(groups) // _GROUPS)
-        length = -(-len(groups) // (tiles * _UNROLL)) * _UNROLL
-        pad = tiles * length - len(groups)
-        groups = jnp.pad(groups, ((0, pad), (0, 0), (0, 0)), constant_values=jnp.inf)
-
-        def closest(queries: Array) -> Array:
-            group = _closest_group(queries, groups.reshape(tiles, length, -1, _GROUP))
-            return _closest_in_group(queries, groups, group)
-
-        row = _by_tiles(closest, scale * lax.stop_gradient(columns), _QUERIES, num)
-        first = jnp.argmax(self.mask).astype(jnp.int32)  # where all are too far
-        return jnp.where(row < 0, first, row)
+        points, scale = self._scaled()
+        columns = scale * lax.stop_gradient(columns)
+        row = by_platform(
+            lambda: _closest(columns, points, num),
+            lambda: all_pairs.closest(columns, points.T),
+        )
+        # Where all are too far.
+        first = jnp.argmax(self.mask).astype(jnp.int32)
+        return jnp.where((row < 0) | ~self.mask[row], first, row)
 
     def lookup_nearest(self, columns: Float[Array, "d n"], k: int) -> Int[Array, "k n"]:
         """The k closest valid targets of each query, exactly; -1 for surplus."""
         if k == 1:
             return closest_only(self, columns, k)
-        groups, scale = self._groups()
+        points, scale = self._scaled()
+        columns = scale * lax.stop_gradient(columns)
+        return by_platform(
+            lambda: _nearest(columns, points, k),
+            lambda: all_pairs.nearest(columns, points.T, k),
+        )
 
-        def nearest(queries: Array) -> Array:
-            least = lax.map(lambda g: _least_distance(queries, g), groups)
-            return _rank(queries, groups, least, k)
-
-        return _by_tiles(nearest, scale * lax.stop_gradient(columns), _QUERIES_RANKED)
-
-    def _groups(self) -> tuple[Float[Array, "g d w"], Float[Array, ""]]:
+    def _scaled(self) -> tuple[Float[Array, "m d"], Float[Array, ""]]:
         """Scaled targets, inf where there is none, and the scale.
 
         The scale is a power of two, so that nothing is rounded, and keeps squared
         distances in the range of the dtype.
         """
         points = lax.stop_gradient(self.points)
-        m, d = points.shape
         largest = jnp.max(jnp.where(self.mask[:, None], jnp.abs(points), 0))
         exponent = jnp.clip(jnp.frexp(largest)[1], -100, 100)
         scale = jnp.ldexp(jnp.ones((), points.dtype), -exponent)
-        scaled = jnp.where(self.mask[:, None], points * scale, jnp.inf)
-        scaled = jnp.pad(scaled, ((0, -m % _GROUP), (0, 0)), constant_values=jnp.inf)
-        return jnp.swapaxes(scaled.reshape(-1, _GROUP, d), 1, 2), scale
+        return jnp.where(self.mask[:, None], points * scale, jnp.inf), scale
+
+
+def _closest(
+    columns: Float[Array, "d n"],
+    points: Float[Array, "m d"],
+    num: Int[Array, ""] | None,
+) -> Int[Array, " n"]:
+    """The first closest point of each query; -1 if none is finite."""
+    groups = _in_groups(points)
+    # Less padding than rounding the number of groups up to a whole tile.
+    tiles = -(-len(groups) // _GROUPS)
+    length = -(-len(groups) // (tiles * _UNROLL)) * _UNROLL
+    pad = tiles * length - len(groups)
+    groups = jnp.pad(groups, ((0, pad), (0, 0), (0, 0)), constant_values=jnp.inf)
+
+    def of_tile(queries: Array) -> Array:
+        group = _closest_group(queries, groups.reshape(tiles, length, -1, _GROUP))
+        return _closest_in_group(queries, groups, group)
+
+    return _by_tiles(of_tile, columns, _QUERIES, num)
+
+
+def _nearest(
+    columns: Float[Array, "d n"], points: Float[Array, "m d"], k: int
+) -> Int[Array, "k n"]:
+    """The k closest points of each query, ascending; -1 for surplus."""
+    groups = _in_groups(points)
+
+    def of_tile(queries: Array) -> Array:
+        least = lax.map(lambda g: _least_distance(queries, g), groups)
+        return _rank(queries, groups, least, k)
+
+    return _by_tiles(of_tile, columns, _QUERIES_RANKED)
+
+
+def _in_groups(points: Float[Array, "m d"]) -> Float[Array, "g d w"]:
+    m, d = points.shape
+    padded = jnp.pad(points, ((0, -m % _GROUP), (0, 0)), constant_values=jnp.inf)
+    return jnp.swapaxes(padded.reshape(-1, _GROUP, d), 1, 2)
 
 
 def _by_tiles(

@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.platforms import by_platform
 from jaxreg._core.typing import Mask, Points, Scalar
 from jaxreg.geometry.spacing import median_spacing
 from jaxreg.neighbours.base import AbstractIndex, closest_only, in_tiles, map_first
@@ -139,10 +140,16 @@ class CellGrid(AbstractIndex):
     def _exactly(
         self, columns: Float[Array, "d n"], num: Int[Array, ""] | None
     ) -> Int[Array, " n"]:
-        tiles = in_tiles(columns, _TILE)
         axes = list(self.ordered)  # copies: here, not in the loop
-        found = map_first(lambda tile: self._of_tile(tile, axes), tiles, num)
-        return self.rows[found.reshape(-1)[: columns.shape[1]]]
+
+        def by_tiles() -> Int[Array, " n"]:
+            tiles = in_tiles(columns, _TILE)
+            found = map_first(lambda tile: self._of_tile(tile, axes), tiles, num)
+            return found.reshape(-1)[: columns.shape[1]]
+
+        # An accelerator waits for each turn of a loop.
+        row = by_platform(by_tiles, lambda: self._of_tile(columns, axes))
+        return self.rows[row]
 
     def _of_tile(
         self, queries: Float[Array, "d t"], axes: list[Float[Array, " m"]]

@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.platforms import platform_of
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Progress
 from jaxreg.batching.devices import Devices, map_rows, spread_rows
@@ -20,6 +21,7 @@ from jaxreg.batching.padding import (
     unstacked,
 )
 from jaxreg.batching.progress import tell
+from jaxreg.batching.side_by_side import side_by_side
 from jaxreg.batching.threads import map_in_threads, num_cores
 from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
 from jaxreg.registration.pair import register_pair
@@ -44,7 +46,7 @@ def register_batch(
     pair: tuple[Array, ...],
     init: Array | None,
     key: Array | None,
-    batch_size: int,
+    batch_size: int | None,
     progress: Progress | None,
     devices: Devices | None,
 ) -> RegistrationSolution:
@@ -76,7 +78,7 @@ def register_lists(
     lists: tuple[list[Array], ...],
     init: Array | None,
     key: Array | None,
-    batch_size: int,
+    batch_size: int | None,
     progress: Progress | None,
     devices: Devices | None,
 ) -> list[RegistrationSolution]:
@@ -128,7 +130,7 @@ def _split(key: Array | None, num: int) -> tuple[Array | None, Hashable]:
 def _in_threads(*inputs: object) -> bool:
     """Whether to use the cores of a CPU, on which XLA runs a loop on one."""
     arrays = jax.tree.leaves(inputs)
-    return jax.default_backend() == "cpu" and all(map(is_concrete, arrays))
+    return platform_of(arrays) == "cpu" and all(map(is_concrete, arrays))
 
 
 def _on_host(arrays: _Tree) -> _Tree:
@@ -141,7 +143,7 @@ def _register_groups(
     groups: list[_Group],
     impl: Hashable,
     threads: bool,
-    batch_size: int,
+    batch_size: int | None,
     progress: Progress | None,
     devices: Devices | None,
 ) -> RegistrationSolution:
@@ -151,10 +153,14 @@ def _register_groups(
 
         def some(rows: np.ndarray, of_rows: Callable = of_rows) -> RegistrationSolution:
             pairs = spread_rows(devices, of_rows(rows))
-            return _register_rows(method, pairs, impl, batch_size, devices)
+            num_points = pairs[0].shape[1] + pairs[1].shape[1]
+            lanes = side_by_side(batch_size, num_points, pairs)
+            return _register_rows(method, pairs, impl, lanes, devices)
 
         rows = np.arange(len(members))
-        for part in _over_cores(some, rows, batch_size) if threads else [some(rows)]:
+        for part in (
+            _over_cores(some, rows, batch_size or 1) if threads else [some(rows)]
+        ):
             parts.append(part)
             done += len(part.status)
             tell(progress, _STAGE, done, total, part)
@@ -205,7 +211,8 @@ def _register_rows(
         return register_pair(method, tuple(arrays), init, key)
 
     # Groups of one would be vectorised over an axis of one: conditions become selects.
-    size = batch_size if batch_size > 1 else None
+    num = len(pairs[0])
+    size = min(batch_size, num) if batch_size > 1 else None
 
     def some(pairs: _Pairs) -> RegistrationSolution:
         return lax.map(one, pairs, batch_size=size)

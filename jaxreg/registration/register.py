@@ -53,7 +53,7 @@ def register(  # pyright: ignore[reportOverlappingOverload]
     *,
     source_mask: ArrayLike | None = None,
     target_mask: ArrayLike | None = None,
-    batch_size: int = 1,
+    batch_size: int | None = None,
     progress: Progress | None = None,
     mesh: Mesh | AbstractMesh | None = None,
 ) -> list[RegistrationSolution]: ...
@@ -69,7 +69,7 @@ def register(
     *,
     source_mask: ArrayLike | None = None,
     target_mask: ArrayLike | None = None,
-    batch_size: int = 1,
+    batch_size: int | None = None,
     progress: Progress | None = None,
     mesh: Mesh | AbstractMesh | None = None,
 ) -> RegistrationSolution: ...
@@ -84,7 +84,7 @@ def register(
     *,
     source_mask: ArrayLike | None = None,
     target_mask: ArrayLike | None = None,
-    batch_size: int = 1,
+    batch_size: int | None = None,
     progress: Progress | None = None,
     mesh: Mesh | AbstractMesh | None = None,
 ) -> RegistrationSolution | list[RegistrationSolution]:
@@ -117,7 +117,8 @@ def register(
             rows that are not finite are masked in any case.
         target_mask: `(m,)` likewise.
         batch_size: of many pairs, those that a core or an accelerator registers side by
-            side. On a CPU one after another is quickest; memory grows with it.
+            side; memory grows with it. By default one after another on a CPU, where
+            that is quickest, and a million points at a time on an accelerator.
         progress: called as `progress(stage, done, total)` as some of many pairs are
             done, on an accelerator all of a size; not for one pair, not under `jit`.
         mesh: a mesh of devices with an axis "pair", over which many pairs are spread;
@@ -168,7 +169,8 @@ def register(
     """
     method = ParticleFilter() if method is None else method
     check_method(method, AbstractRegistrar)
-    check_count(batch_size, "batch_size")
+    if batch_size is not None:
+        check_count(batch_size, "batch_size")
     check_callable(progress, "progress")
     key = None if key is None else check_key(key)
     devices = chosen_devices(mesh, source)

@@ -116,6 +116,7 @@ def fake(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, absent: str):
         "out": str(tmp_path),
         "data": str(tmp_path),
         "resume": False,
+        "accelerator": False,
         "run": "first",
         "cores": [0],
         "running": str(tmp_path / "running.json"),

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.arrays import place_among
 from jaxreg._core.quantile import nearest_rank
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.world.levels import Levels
@@ -118,4 +119,4 @@ def _spread(own: Bool[Array, " p"]) -> Int[Array, " m"]:
     most = min(len(own), CHOICES)
     step = jnp.maximum(count[-1] / most, 1)
     wanted = jnp.floor(jnp.arange(most) * step).astype(count.dtype) + 1
-    return jnp.minimum(jnp.searchsorted(count, wanted), len(own) - 1)
+    return jnp.minimum(place_among(count, wanted), len(own) - 1)

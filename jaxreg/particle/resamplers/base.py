@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.arrays import place_among
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.checks import check_not_negative
 from jaxreg._core.typing import Key
@@ -121,5 +122,5 @@ def equal(like: Float[Array, " p"], num: int) -> Float[Array, " p"]:
 def rows_at(weight: Float[Array, " p"], share: Float[Array, " q"]) -> Int[Array, " q"]:
     """The rows in which the cumulated share of the weight exceeds `share` in [0, 1)."""
     cumulative = jnp.cumsum(weight)
-    rows = jnp.searchsorted(cumulative, share * cumulative[-1], side="right")
+    rows = place_among(cumulative, share * cumulative[-1], "right")
     return jnp.minimum(rows, weight.shape[0] - 1).astype(jnp.int32)

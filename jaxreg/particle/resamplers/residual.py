@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxreg._core.arrays import traced
+from jaxreg._core.arrays import place_among, traced
 from jaxreg._core.typing import Key
 from jaxreg.particle.resamplers.base import AbstractHardResampler, rows_at
 
@@ -27,7 +27,7 @@ class Residual(AbstractHardResampler):
         share = num * weight
         whole = jnp.floor(share)
         place = jnp.arange(weight.shape[0], dtype=weight.dtype)
-        rows = jnp.searchsorted(jnp.cumsum(whole), place, side="right")
+        rows = place_among(jnp.cumsum(whole), place, "right")
         u = jax.random.uniform(key, weight.shape, weight.dtype)
         rest = rows_at(share - whole, u)
         return jnp.where(place < jnp.sum(whole), rows, rest).astype(jnp.int32)
