@@ -54,7 +54,7 @@ def run(command: Register, session: Session) -> int:
     if not result.believed:
         who = f"{command.source} onto {command.target}: {result.status.name}"
         return outputs.tell_failure(session, result, who, result.status)
-    _show(session, result)
+    _show(session, result, f" {command.unit[1]}" if command.unit else "")
     return 0
 
 
@@ -136,11 +136,11 @@ def _register(
     return result, modes, np.stack([np.zeros_like(covariance), covariance])
 
 
-def _show(session: Session, result: Result) -> None:
+def _show(session: Session, result: Result, unit: str) -> None:
     target, source = result.names
     session.console.print(
         f"{result.status.name}: {source} lies on {target} with overlap "
-        f"{result.overlap[0]:.3f} and inlier RMSE {result.inlier_rmse[0]:.4g}."
+        f"{result.overlap[0]:.3f} and inlier RMSE {result.inlier_rmse[0]:.4g}{unit}."
     )
     if result.status != Status.CONVERGED:
         session.console.print(terminal_advice(result.status))

@@ -68,7 +68,8 @@ def write_report(
         errors: against a known truth: `names`, `e_R` (radians), `e_t` (unit of the
             scans) and the means `mean_e_R`, `mean_e_t`.
         details: how the result was made: any of `command`, `seed`, `settings`,
-            `times_s`, `versions` (those of this process by default).
+            `times_s`, `versions` (those of this process by default), and `unit`, the
+            name of that of lengths, such as "m", which is then shown beside them.
 
     Raises:
         InputError: if the file cannot be written.

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -169,13 +170,14 @@ def test_options_of_a_pair_that_cannot_be_used_are_named(
 
 
 def test_units_are_those_of_the_files_in_json_and_of_the_target_in_points(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     given = _given_init(folder, monkeypatch)
     np.save("mm.npy", 1000 * np.load("s1.npy"))
     run = ["register", "mm.npy", "s0.npy", "--unit", "mm", "m"]
     guess = POSES[1] @ np.diag([0.001, 0.001, 0.001, 1])
     assert main([*run, "--init", " ".join(map(str, guess.ravel()))]) == 0
+    assert re.search(r"inlier RMSE \S+ m\.", capsys.readouterr().out)
     np.testing.assert_allclose(np.linalg.det(given[0][0]), 1, atol=1e-5)
     found = json.loads(Path("jaxreg-out/result.json").read_text())
     T = np.array(found["T_world_i"][1])

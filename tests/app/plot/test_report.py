@@ -317,11 +317,14 @@ def test_flat_scans_from_a_solution(page: Page, tmp_path: Path):
     source = move(motion(1, 2, angle=0.05, shift=0.02), target)
     sol = jaxreg.register(source, target, method=jaxreg.ICP())
     path = tmp_path / "report.html"
-    write_report(path, [target, source], sol)
+    write_report(path, [target, source], sol, details={"unit": "mm"})
     page.open(path)
     assert (
         page.run("document.getElementById('title').textContent") == "source onto target"
     )
+    text = page.run("document.body.innerText")
+    assert "translation in mm," in text
+    assert "tx [mm]" in text
     assert page.run("document.getElementById('section-card').hidden")
     assert page.run("document.getElementById('curves-card').hidden")
     assert _ink(page, tmp_path / "shot.png") > 0.005

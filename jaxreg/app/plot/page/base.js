@@ -4,6 +4,8 @@
 const DATA = JSON.parse(await unpacked("data"));
 const FLAT = DATA.dim === 2;
 const SCANS = DATA.kind === "scans";
+// Of lengths, if it was told: beside every one.
+const UNIT = DATA.details.unit || "";
 const CONFIG = { responsive: true, displayModeBar: false, scrollZoom: true };
 const FAR_COLOR = [139, 144, 150];
 // Blue where scans agree, red at the end of the scale.
@@ -29,6 +31,10 @@ function change(part) {
   Object.assign(state, part);
   for (const listener of listeners) listener(part);
 }
+
+function inUnit(name) { return UNIT ? `${name} [${UNIT}]` : name; }
+
+function asLength(x, digits) { return UNIT ? `${number(x, digits)} ${UNIT}` : number(x, digits); }
 
 function $(id) { return document.getElementById(id); }
 

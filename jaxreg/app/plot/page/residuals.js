@@ -61,7 +61,7 @@ function startResiduals() {
       margin: { l: 56, r: 10, t: 6, b: 44 }, shapes: lines, hovermode: "closest",
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { color: theme("--soft"), size: 11 }, legend: { orientation: "h", y: 1.02, yanchor: "bottom" },
-      xaxis: axis("distance [unit of the input]"), yaxis: axis("angle [°]"),
+      xaxis: axis(`distance [${UNIT || "unit of the input"}]`), yaxis: axis("angle [°]"),
     }, { ...CONFIG, scrollZoom: false });
   };
   draw();

@@ -38,9 +38,9 @@ function posesTable() {
   const names = AXES.slice(0, DATA.dim);
   const turns = FLAT ? ["angle [°]"] : names.map((a) => `r${a} [°]`);
   const heads = [SCANS ? "scan" : "frame", ...(withStatus ? ["status"] : []),
-    ...names.map((a) => `t${a}`), ...turns,
-    ...(withSigma ? ["σ position", "σ angle [°]"] : []),
-    ...(withErrors ? ["error t", "error R [°]"] : [])];
+    ...names.map((a) => inUnit(`t${a}`)), ...turns,
+    ...(withSigma ? [inUnit("σ position"), "σ angle [°]"] : []),
+    ...(withErrors ? [inUnit("error t"), "error R [°]"] : [])];
   const body = rows.map((s) => {
     const name = el("span", {}, ...(s.color
       ? [el("span", { class: "dot", style: `background:${rgb(s.color)}` })] : []), s.name);
@@ -59,8 +59,8 @@ function posesTable() {
     : ` The first ${rows.length} of ${DATA.num_poses}; poses.tum holds all.`;
   const noise = DATA.sigma_by || "what the trusted pairs show as noise";
   const sigma = withSigma ? ` σ is by ${noise}.` : "";
-  $("poses-note").textContent = "From each frame to the common one: translation in the " +
-    `unit of the input, rotation ${FLAT ? "angle" : "vector"} in degrees.${sigma}${more}`;
+  $("poses-note").textContent = "From each frame to the common one: translation in " +
+    `${UNIT || "the unit of the input"}, rotation ${FLAT ? "angle" : "vector"} in degrees.${sigma}${more}`;
   $("poses").append(table(heads, body));
 }
 
@@ -81,10 +81,10 @@ function header() {
       if (NUM_MODELS > 1) tile(NUM_MODELS, "components, each in a frame of its own", "warn");
     } else if (DATA.pairs.length) {
       tile(number(DATA.pairs[0].overlap, 3), "overlap");
-      tile(number(DATA.pairs[0].rmse, 3), "inlier RMSE");
+      tile(asLength(DATA.pairs[0].rmse, 3), "inlier RMSE");
     }
     if (DATA.errors) {
-      tile(number(DATA.errors.mean_e_t, 3), "mean error of position");
+      tile(asLength(DATA.errors.mean_e_t, 3), "mean error of position");
       tile(`${number(degrees(DATA.errors.mean_e_R), 3)}°`, "mean error of rotation");
     }
   } else {
