@@ -5,6 +5,8 @@ Maximum Correntropy Criterion (the MCC paper); start, widths and steps go beyond
 `MCC` is the published algorithm.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -36,6 +38,7 @@ from jaxreg.averaging.steps.kernel_width import (
     first_width,
     followed_width,
     gaussian_trust,
+    settled_width,
 )
 from jaxreg.averaging.steps.rows import RootRows
 from jaxreg.graph.pose_graph import PoseGraph
@@ -65,9 +68,9 @@ class Correntropy(AbstractAverager):
     change the answer.
 
     Gradients: implicit at the fixed point with respect to `T_i_j`, `weight` and
-    `information`; length scale and start are cut. Widths are followed if they have
-    settled; widths that would grow, but may not, and those of graphs above
-    `DENSE_LIMIT` frames, are held, and then the derivative is that at held widths.
+    `information`; length scale and start are cut. Widths are followed where they have
+    settled; those that did not settle near where annealing ended, and those of graphs
+    above `DENSE_LIMIT` frames, are held: the derivative is that at held widths.
     """
 
     max_steps: int = eqx.field(static=True, default=100)
@@ -118,6 +121,7 @@ class Correntropy(AbstractAverager):
                 gauss_newton_step,
                 max_steps=self.max_steps,
                 tolerance=self.tolerance,
+                then=partial(settled_width, scale),
             )
 
         def narrower(tried: tuple[Array, Array, Iterated]) -> tuple:
