@@ -5,8 +5,6 @@ Maximum Correntropy Criterion (the MCC paper); start, widths and steps go beyond
 `MCC` is the published algorithm.
 """
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,7 +30,7 @@ from jaxreg.averaging.steps.gauss_newton import (
     gauss_newton_gradients,
     gauss_newton_step,
 )
-from jaxreg.averaging.steps.iterate import Iterated, iterate, solution_of
+from jaxreg.averaging.steps.iterate import Iterated, going_on, iterate, solution_of
 from jaxreg.averaging.steps.kernel_width import (
     annealed_width,
     first_width,
@@ -121,7 +119,6 @@ class Correntropy(AbstractAverager):
                 gauss_newton_step,
                 max_steps=self.max_steps,
                 tolerance=self.tolerance,
-                then=partial(settled_width, scale),
             )
 
         def narrower(tried: tuple[Array, Array, Iterated]) -> tuple:
@@ -137,9 +134,27 @@ class Correntropy(AbstractAverager):
             narrower,
             (jnp.asarray(0, jnp.int32), jnp.full_like(least, -jnp.inf), blank),
         )
+        end = self._settled(fixed, end)
         followed = eqx.Partial(followed_width, scale)
         end = gauss_newton_gradients(graph, end, gaussian_trust, followed)
         return solution_of(graph, _or_start(graph, end, T_start))
+
+    def _settled(self, graph: PoseGraph, end: Iterated) -> Iterated:
+        """Widths settle, unless that blurs: it would lose likelihood."""
+        last = iterate(
+            graph,
+            end.T_world_i,
+            end.width,
+            settled_width(graph.length_scale, end.width),
+            gaussian_trust,
+            gauss_newton_step,
+            max_steps=self.max_steps,
+            tolerance=self.tolerance,
+        )
+        least = least_after_fitting(explained(graph, end.T_world_i))
+        kept = explained(graph, last.T_world_i).log_ratio >= least
+        both = going_on(end, last), end
+        return jax.tree.map(lambda a, b: jnp.where(kept, a, b), *both)
 
     @kept_program
     def _large(

@@ -1,6 +1,5 @@
 """The loop of motion averaging: kernel width, trust, one solve, updated poses."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -28,8 +27,6 @@ from jaxreg.linear.small import product
 STEP_TOLERANCE = 1e-2
 #: A width that changes by less than this share stands still.
 STILL = 1e-3
-# Radians, and shares of the scene: so little is left to do for the last widths.
-_NEARLY = 1e-3
 #: Kernel widths `(2,)` (length, radians) at given poses, from the widths before.
 WidthOf = Callable[[PoseGraph, Array, Array], Array]
 #: Trust of each edge `(e,)` at given poses and widths.
@@ -52,6 +49,26 @@ class Iterated(NamedTuple):
     converged: Bool[Array, ""]
     num_steps: Int[Array, ""]
     trace: AveragingTrace
+
+
+def going_on(first: Iterated, then: Iterated) -> Iterated:
+    """The second end, with the steps of both, as far as there is room for them."""
+    num, room = first.num_steps, len(first.trace.change)
+
+    def both(a: Array, b: Array) -> Array:
+        at = jnp.arange(room) - num
+        later = (at >= 0).reshape(-1, *[1] * (a.ndim - 1))
+        return jnp.where(later, b[jnp.maximum(at, 0)], a)
+
+    num_steps = jnp.minimum(num + then.num_steps, room)
+    one, two = first.trace, then.trace
+    trace = AveragingTrace(
+        num_steps,
+        both(one.change, two.change),
+        both(one.kernel_width, two.kernel_width),
+        both(one.trust, two.trust),
+    )
+    return then._replace(num_steps=num_steps, trace=trace)
 
 
 def solution_of(graph: PoseGraph, end: Iterated) -> AveragingSolution:
@@ -141,12 +158,8 @@ def iterate(
     *,
     max_steps: int,
     tolerance: Array | float,
-    then: Callable[[Array], WidthOf] | None = None,
 ) -> Iterated:
     """Alternates weights and steps until widths and poses stand still.
-
-    Given `then`, they first come to rest within a thousandth, and from there go on with
-    the widths that it gives from those of that end.
 
     Stops when no rotation moves by more than `tolerance` radians, no position by more
     than `tolerance` of the size of the scene, and no width shrinks by more than
@@ -157,17 +170,11 @@ def iterate(
         (graph, T_start, width_start, tolerance)
     )
     limit = jnp.maximum(tolerance, 32 * jnp.finfo(T_start.dtype).eps)
-    first = limit if then is None else jnp.maximum(limit, _NEARLY)
     averaging = _Averaging(
-        graph, graph.length_scale, first, width_of, trust_of, step_of, max_steps
+        graph, graph.length_scale, limit, width_of, trust_of, step_of, max_steps
     )
     begin = averaging.init((T_start, width_start))
     ended = loop.iterate(averaging, begin, max_steps=max_steps)
-    if then is not None:
-        at = ended.state
-        averaging = dataclasses.replace(averaging, width_of=then(at.width), limit=limit)
-        begin = at._replace(change=jnp.full_like(at.change, jnp.inf))
-        ended = loop.iterate(averaging, begin, max_steps=max_steps)
     end = ended.state
     trust = trust_of(graph, end.T, end.width)
     trace = AveragingTrace.of(end.rows, end.num_steps)
