@@ -30,13 +30,12 @@ from jaxreg.averaging.steps.gauss_newton import (
     gauss_newton_gradients,
     gauss_newton_step,
 )
-from jaxreg.averaging.steps.iterate import Iterated, going_on, iterate, solution_of
+from jaxreg.averaging.steps.iterate import Iterated, iterate, solution_of
 from jaxreg.averaging.steps.kernel_width import (
     annealed_width,
     first_width,
     followed_width,
     gaussian_trust,
-    settled_width,
 )
 from jaxreg.averaging.steps.rows import RootRows
 from jaxreg.graph.pose_graph import PoseGraph
@@ -66,9 +65,9 @@ class Correntropy(AbstractAverager):
     change the answer.
 
     Gradients: implicit at the fixed point with respect to `T_i_j`, `weight` and
-    `information`; length scale and start are cut. Widths are followed where they have
-    settled; those that did not settle near where annealing ended, and those of graphs
-    above `DENSE_LIMIT` frames, are held: the derivative is that at held widths.
+    `information`; length scale and start are cut. Widths are followed if they have
+    settled; widths that would grow, but may not, and those of graphs above
+    `DENSE_LIMIT` frames, are held, and then the derivative is that at held widths.
     """
 
     max_steps: int = eqx.field(static=True, default=100)
@@ -134,27 +133,9 @@ class Correntropy(AbstractAverager):
             narrower,
             (jnp.asarray(0, jnp.int32), jnp.full_like(least, -jnp.inf), blank),
         )
-        end = self._settled(fixed, end)
         followed = eqx.Partial(followed_width, scale)
         end = gauss_newton_gradients(graph, end, gaussian_trust, followed)
         return solution_of(graph, _or_start(graph, end, T_start))
-
-    def _settled(self, graph: PoseGraph, end: Iterated) -> Iterated:
-        """Widths settle, unless that blurs: it would lose likelihood."""
-        last = iterate(
-            graph,
-            end.T_world_i,
-            end.width,
-            settled_width(graph.length_scale, end.width),
-            gaussian_trust,
-            gauss_newton_step,
-            max_steps=self.max_steps,
-            tolerance=self.tolerance,
-        )
-        least = least_after_fitting(explained(graph, end.T_world_i))
-        kept = explained(graph, last.T_world_i).log_ratio >= least
-        both = going_on(end, last), end
-        return jax.tree.map(lambda a, b: jnp.where(kept, a, b), *both)
 
     @kept_program
     def _large(
