@@ -19,9 +19,9 @@ from jaxreg.averaging import (
     average,
 )
 from jaxreg.averaging.steps.gauss_newton import (
-    gauss_newton_gradients,
     gauss_newton_step,
 )
+from jaxreg.averaging.steps.gradients import gauss_newton_gradients
 from jaxreg.averaging.steps.iterate import iterate
 from jaxreg.averaging.steps.kernel_width import annealed_width, gaussian_trust
 from jaxreg.graph import PoseGraph

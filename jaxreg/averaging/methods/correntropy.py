@@ -26,10 +26,8 @@ from jaxreg.averaging.methods.graduated import graduated
 from jaxreg.averaging.methods.motion_averaging import iterate_plain
 from jaxreg.averaging.start.closures import without_lone_closures
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus
-from jaxreg.averaging.steps.gauss_newton import (
-    gauss_newton_gradients,
-    gauss_newton_step,
-)
+from jaxreg.averaging.steps.gauss_newton import gauss_newton_step
+from jaxreg.averaging.steps.gradients import gauss_newton_gradients
 from jaxreg.averaging.steps.iterate import Iterated, iterate, solution_of
 from jaxreg.averaging.steps.kernel_width import (
     annealed_width,

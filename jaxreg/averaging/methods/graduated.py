@@ -23,7 +23,8 @@ from jaxreg.averaging.likelihood import (
 )
 from jaxreg.averaging.measures import weighted_mean
 from jaxreg.averaging.steps.edge_errors import LogError
-from jaxreg.averaging.steps.gauss_newton import gauss_newton_gradients, precisions
+from jaxreg.averaging.steps.gauss_newton import precisions
+from jaxreg.averaging.steps.gradients import gauss_newton_gradients
 from jaxreg.averaging.steps.iterate import Iterated, pose_change
 from jaxreg.averaging.steps.kernel_width import (
     chi2_median,

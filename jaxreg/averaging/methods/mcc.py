@@ -22,12 +22,8 @@ from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.measures import frobenius, weighted_mean
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus
-from jaxreg.averaging.steps.iterate import (
-    averaging_gradients,
-    averaging_step,
-    iterate,
-    solution_of,
-)
+from jaxreg.averaging.steps.gradients import averaging_gradients
+from jaxreg.averaging.steps.iterate import averaging_step, iterate, solution_of
 from jaxreg.averaging.steps.kernel_width import gaussian_trust
 from jaxreg.averaging.steps.rows import AbstractRows, RootRows
 from jaxreg.graph.pose_graph import PoseGraph
@@ -95,8 +91,14 @@ class MCC(AbstractAverager):
             max_steps=self.max_steps,
             tolerance=self.tolerance,
         )
-        followed = eqx.Partial(_trust, self.alpha, scale)
-        return solution_of(graph, averaging_gradients(graph, end, followed, self.rows))
+        end = averaging_gradients(
+            graph,
+            end,
+            gaussian_trust,
+            self.rows,
+            eqx.Partial(_width, self.alpha, scale),
+        )
+        return solution_of(graph, end)
 
 
 def _width(
@@ -107,9 +109,3 @@ def _width(
     sigma = alpha * jnp.maximum(e, 64 * jnp.finfo(e.dtype).eps)
     # The Frobenius norm of a small rotation is sqrt(2) times its angle.
     return jnp.stack([sigma * scale, sigma / jnp.sqrt(jnp.asarray(2, e.dtype))])
-
-
-def _trust(
-    alpha: Array | float, scale: Array, g: PoseGraph, T: Array, width: Array
-) -> Float[Array, " e"]:
-    return gaussian_trust(g, T, _width(alpha, scale, g, T, width))

@@ -15,11 +15,11 @@ from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.methods.shortest_paths import ShortestPaths
+from jaxreg.averaging.steps.gradients import averaging_gradients
 from jaxreg.averaging.steps.iterate import (
     STEP_TOLERANCE,
     Iterated,
     averaged,
-    averaging_gradients,
     held_width,
     iterate,
     solution_of,

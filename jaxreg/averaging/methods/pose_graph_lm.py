@@ -28,6 +28,7 @@ from jaxreg.averaging.methods.motion_averaging import MotionAveraging
 from jaxreg.averaging.steps.charts import Minimum as SolverMinimum
 from jaxreg.averaging.steps.charts import minimise_by
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError, LogError
+from jaxreg.averaging.steps.edge_jacobian import edge_jacobian
 from jaxreg.averaging.steps.implicit import differentiable
 from jaxreg.averaging.steps.levenberg_marquardt import (
     Minimum,
@@ -169,7 +170,8 @@ class PoseGraphLM(AbstractAverager):
         top = jnp.max(stiffness)
         weight = stiffness / jnp.where(top > 0, top, 1)
         precondition = eqx.Partial(_nearly_balanced, graph.edges, Q)
-        return differentiable(graph, T, self._imbalance, weight, precondition)
+        jacobian = eqx.Partial(edge_jacobian, self._imbalance)
+        return differentiable(graph, T, self._imbalance, weight, precondition, jacobian)
 
     def _imbalance(self, graph: PoseGraph, T: Array) -> Array:
         force = self.problem(graph).normal(T)[1]

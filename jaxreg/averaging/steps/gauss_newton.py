@@ -4,13 +4,10 @@ Motion averaging solves for rotations and translations side by side, which is fa
 nearly right; here each part counts at its own precision.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.averaging.steps.implicit import differentiable
-from jaxreg.averaging.steps.iterate import Iterated, TrustOf, WidthOf, held_width
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.small import product
@@ -109,30 +106,3 @@ def gauss_newton_step(
     )
     tangent = -(inverse_root * x[:, 0]).reshape(graph.num_poses, -1)
     return product(T_world_i, lie.exp(tangent))
-
-
-def gauss_newton_gradients(
-    graph: PoseGraph,
-    end: Iterated,
-    trust_of: TrustOf,
-    width_of: WidthOf = held_width,
-) -> Iterated:
-    """The same result with derivatives by the balance of forces at the minimum.
-
-    `width_of` gives the width of the end the derivatives that it is to have. Both
-    functions are pytrees of the values that they use.
-    """
-    held = jax.lax.stop_gradient(graph.weight * end.trust)
-    top = jnp.max(held)
-    held = held / jnp.where(top > 0, top, 1)
-    imbalance = eqx.Partial(_net_force, trust_of, width_of, end.width)
-    T = differentiable(graph, end.T_world_i, imbalance, held)
-    width = width_of(graph, T, end.width)
-    return end._replace(T_world_i=T, trust=trust_of(graph, T, width), width=width)
-
-
-def _net_force(
-    trust_of: TrustOf, width_of: WidthOf, width: Array, g: PoseGraph, T: Array
-) -> Array:
-    width = width_of(g, T, width)
-    return forces(g, T, precisions(g, trust_of(g, T, width), width))

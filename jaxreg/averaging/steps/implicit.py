@@ -5,6 +5,7 @@ are differentiated through that equation, not through the loop that found them.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -31,6 +32,7 @@ class _Balance(eqx.Module):
     free: Bool[Array, "v 1"]
     weight: Float[Array, " e"]
     precondition: Callable[[Array], Array] | None
+    jacobian: Callable[[PoseGraph, Array], Array] | None
 
     def residual(
         self, x: Float[Array, "v k"], T_world_i: Float[Array, "v D D"]
@@ -38,6 +40,15 @@ class _Balance(eqx.Module):
         """The imbalance at left tangents; of frames that are held, the tangent."""
         balance = self.imbalance(self.graph, product(lie.exp(x), T_world_i))
         return jnp.where(self.free, balance, x)
+
+    def matrix(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, "n n"] | None:
+        """The derivative of the residual by all tangents; None of a large graph."""
+        num = len(T_world_i) * lie.tangent_dim(self.graph.dim)
+        if self.jacobian is None or num > DENSE_UNKNOWNS:
+            return None
+        free = jnp.repeat(self.free[:, 0], num // len(T_world_i))
+        J = self.jacobian(self.graph, T_world_i)
+        return jnp.where(free[:, None], J, jnp.eye(num, dtype=J.dtype))
 
     def solve(self, linear: Callable[[Array], Array], y: Array) -> Array:
         """X of linear(x) = y, the derivative of the residual or its transpose."""
@@ -58,6 +69,7 @@ def differentiable(
     imbalance: Callable[[PoseGraph, Array], Array],
     weight: Float[Array, " e"],
     precondition: Callable[[Array], Array] | None = None,
+    jacobian: Callable[[PoseGraph, Array], Array] | None = None,
 ) -> Float[Array, "v D D"]:
     """The same poses, with derivatives with respect to the values of the graph.
 
@@ -73,12 +85,15 @@ def differentiable(
         weight: `(e,)` Laplacian weights of at most 1; frames without any are held.
         precondition: maps `(v, k)` by about the inverse of that derivative, for graphs
             that are too large for a dense matrix; by default the inverse Laplacian.
+        jacobian: the derivative of the imbalance by left tangents, `(v k, v k)`, at
+            given poses of a small graph; by default one product for each unknown.
     """
     fixed, weight = jax.lax.stop_gradient((T_world_i, weight))
     i, j = graph.edges[:, 0], graph.edges[:, 1]
     touched = jnp.zeros(fixed.shape[:1], weight.dtype).at[i].add(weight)
     free = (touched.at[j].add(weight) > 0).at[0].set(False)[:, None]
-    return _balanced(_Balance(graph, imbalance, fixed, free, weight, precondition))
+    parts = imbalance, fixed, free, weight, precondition, jacobian
+    return _balanced(_Balance(graph, *parts))
 
 
 @eqx.filter_custom_jvp
@@ -95,8 +110,17 @@ def _balanced_jvp(primals: tuple[_Balance], tangents: tuple) -> tuple[Array, Arr
     if along is None:  # nothing that is differentiated has an influence
         return T, jnp.zeros_like(T)
     linear = jax.linearize(lambda x: at.residual(x, T), still)[1]
-    x = -jax.lax.custom_linear_solve(linear, along, at.solve, at.solve)
+    J = at.matrix(T)
+    if J is None:
+        x = -jax.lax.custom_linear_solve(linear, along, at.solve, at.solve)
+    else:
+        there, back = partial(_solve, J), partial(_solve, J.T)
+        x = -jax.lax.custom_linear_solve(linear, along, there, back)
     return T, jax.jvp(lambda x: product(lie.exp(x), T), (still,), (x,))[1]
+
+
+def _solve(J: Float[Array, "n n"], _: Callable[[Array], Array], y: Array) -> Array:
+    return jnp.linalg.solve(J, y.reshape(-1)).reshape(y.shape)
 
 
 def _dense(linear: Callable[[Array], Array], y: Array) -> Array:

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -12,13 +11,11 @@ from jaxreg._core import loop
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.base import AveragingSolution, solution
 from jaxreg.averaging.measures import weighted_mean
-from jaxreg.averaging.steps.implicit import differentiable
 from jaxreg.averaging.steps.rows import AbstractRows
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import solve_flow
-from jaxreg.linear.operator import divergence
 from jaxreg.linear.small import product
 
 
@@ -96,36 +93,6 @@ def averaged(
     """The poses after one step; `solve` finds tangents from logarithms (Eq. 20)."""
     tangent = solve(lie.log(graph.residual_motions(T)))
     return nearby_rotation(product(lie.exp(tangent), T))
-
-
-def averaging_gradients(
-    graph: PoseGraph, end: Iterated, trust_of: TrustOf, rows: AbstractRows
-) -> Iterated:
-    """The same result with derivatives by the balance of flows at the fixed point.
-
-    `trust_of` is a pytree of the values that it uses.
-    """
-    fixed = jax.lax.stop_gradient(graph)
-    held = rows.squared(fixed, end.trust)
-    top = jnp.max(held)
-    top = jnp.where(top > 0, top, 1)
-    imbalance = eqx.Partial(_net_flow, trust_of, rows, end.width, top)
-    T = differentiable(graph, end.T_world_i, imbalance, held / top)
-    return end._replace(T_world_i=T, trust=trust_of(graph, T, end.width))
-
-
-def _net_flow(
-    trust_of: TrustOf,
-    rows: AbstractRows,
-    width: Array,
-    top: Array,
-    g: PoseGraph,
-    T: Array,
-) -> Array:
-    """What flows into each frame, by weights over the largest."""
-    weight = rows.squared(g, trust_of(g, T, width)) / top
-    flow = weight[:, None] * lie.log(g.residual_motions(T))
-    return divergence(g.edges, flow, g.num_poses)
 
 
 def iterate(
