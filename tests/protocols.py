@@ -82,9 +82,7 @@ AVERAGERS = {
     "WeightedMotionAveraging": Row(
         lambda d: jr.WeightedMotionAveraging(tolerance=1e-13), _EXACT
     ),
-    "Correntropy": Row(
-        lambda d: jr.Correntropy(tolerance=1e-13), {"gradients": "at held widths"}
-    ),
+    "Correntropy": Row(lambda d: jr.Correntropy(tolerance=1e-13), _EXACT),
     "MCC": Row(
         lambda d: jr.MCC(tolerance=1e-13, max_steps=400, initialiser=jr.SpanningTree()),
         _EXACT,

@@ -39,7 +39,7 @@ def check_averager(
     method: AbstractAverager,
     *,
     d: int = 3,
-    gradients: Literal["exact", "at held widths", "refused"] | None = None,
+    gradients: Literal["exact", "refused"] | None = None,
     turns: bool = True,
     lengths: bool = False,
 ) -> AveragingSolution:
@@ -57,9 +57,8 @@ def check_averager(
             gradients converged to about 1e-13.
         d: dimension of space, 2 or 3.
         gradients: "exact" where those of the poses by motions and weights are those of
-            central differences, "at held widths" where they are for changes that leave
-            all residuals, "refused" where asking for them raises a TypeError; None
-            promises nothing.
+            central differences, "refused" where asking for them raises a TypeError;
+            None promises nothing.
         turns: whether poses follow turns of the frames, though motions are noisy.
         lengths: whether a radian counts as one unit of length; then the unit stays.
 
@@ -128,11 +127,6 @@ def _changes(d: int, gradients: str | None) -> list[Change]:
     rng = np.random.default_rng(1)
     T, weight, mask = _problem(d)
     change = np.zeros_like(T)
-    if gradients == "at held widths":  # as if every frame were turned
-        turn = np.zeros((NUM_POSES, d + 1, d + 1))
-        turn[:, :d, :d] = skew(rng, NUM_POSES, d)
-        i, j = EDGES.T
-        return [(T @ turn[j] - turn[i] @ T, 0 * weight)]
     if gradients == "exact":  # of motions, keeping their lengths; of weights
         turn = skew(rng, len(EDGES), d)
         change[:, :d, :d] = T[:, :d, :d] @ turn

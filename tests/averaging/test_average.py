@@ -224,7 +224,10 @@ def test_the_trace_tells_how_the_kernel_narrowed_and_the_steps_came_to_rest():
         assert len(rows) == method.max_steps
         assert not np.any(rows[num:])
     width = np.asarray(trace.kernel_width[:num])
-    assert (np.diff(width, axis=0) <= 0).all()
+    # It halves at most, and settles where it is three deviations, less than that above.
+    lowest = np.minimum.accumulate(width)
+    assert (width[1:] >= 0.499 * width[:-1]).all()
+    assert (width <= 2.001 * lowest).all()
     np.testing.assert_array_equal(width[-1], solution.kernel_width)
     assert trace.change[num - 1] < 1e-5 < trace.change[0]
     trust = float(jnp.mean(solution.edge_weight))

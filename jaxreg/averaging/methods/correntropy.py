@@ -18,6 +18,7 @@ from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.likelihood import (
     DEVIATIONS,
+    Explained,
     explained,
     least_after_fitting,
     log_evidence,
@@ -28,17 +29,28 @@ from jaxreg.averaging.start.closures import without_lone_closures
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus
 from jaxreg.averaging.steps.gauss_newton import gauss_newton_step
 from jaxreg.averaging.steps.gradients import gauss_newton_gradients
-from jaxreg.averaging.steps.iterate import Iterated, iterate, solution_of
+from jaxreg.averaging.steps.iterate import (
+    Iterated,
+    WidthOf,
+    going_on,
+    iterate,
+    solution_of,
+)
 from jaxreg.averaging.steps.kernel_width import (
     annealed_width,
     first_width,
     followed_width,
     gaussian_trust,
+    settled_width,
 )
 from jaxreg.averaging.steps.rows import RootRows
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import along_frames
 from jaxreg.linear.laplacian import DENSE_LIMIT
+
+
+# Radians, and shares of the scene: so little is left to do.
+_NEARLY = 1e-3
 
 
 class Correntropy(AbstractAverager):
@@ -63,9 +75,9 @@ class Correntropy(AbstractAverager):
     change the answer.
 
     Gradients: implicit at the fixed point with respect to `T_i_j`, `weight` and
-    `information`; length scale and start are cut. Widths are followed if they have
-    settled; widths that would grow, but may not, and those of graphs above
-    `DENSE_LIMIT` frames, are held, and then the derivative is that at held widths.
+    `information`; length scale and start are cut. Widths are followed where they have
+    settled; those that did not settle near where annealing ended, and those of graphs
+    above `DENSE_LIMIT` frames, are held: the derivative is that at held widths.
     """
 
     max_steps: int = eqx.field(static=True, default=100)
@@ -102,38 +114,70 @@ class Correntropy(AbstractAverager):
         """
         fixed, T_start = jax.lax.stop_gradient((graph, T_start))
         scale = fixed.length_scale
-        T = _better_start(fixed, T_start, fixed)
-        least = least_after_fitting(explained(fixed, T))
+        T, found = _better_start(fixed, T_start, fixed)
+        least = least_after_fitting(found)
         width = first_width(fixed, T)
 
-        def from_width(width: Array) -> Iterated:
-            return iterate(
-                fixed,
-                T,
-                width,
-                lambda g, T, w: annealed_width(g, T, w, scale),
-                gaussian_trust,
-                gauss_newton_step,
-                max_steps=self.max_steps,
-                tolerance=self.tolerance,
-            )
+        def annealing(g: PoseGraph, T: Array, width: Array) -> Array:
+            return annealed_width(g, T, width, scale)
 
-        def narrower(tried: tuple[Array, Array, Iterated]) -> tuple:
+        def from_width(width: Array) -> Iterated:
+            return self._steps(fixed, T, width, annealing, _NEARLY)
+
+        def narrower(tried: tuple[Array, Explained, Iterated]) -> tuple:
             number = tried[0]
             end = from_width(width / 2**number)
-            return number + 1, explained(fixed, end.T_world_i).log_ratio, end
+            return number + 1, explained(fixed, end.T_world_i), end
 
         blank = jax.eval_shape(lambda: from_width(width))
         blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
+        nothing = found._replace(log_ratio=jnp.full_like(least, -jnp.inf))
         # Not on the driver: what it would carry is a number and whole ends of it.
-        _, _, end = control.while_loop(
-            lambda tried: (tried[1] < least) & (tried[0] < len(DEVIATIONS)),
+        _, found, end = control.while_loop(
+            lambda tried: (tried[1].log_ratio < least) & (tried[0] < len(DEVIATIONS)),
             narrower,
-            (jnp.asarray(0, jnp.int32), jnp.full_like(least, -jnp.inf), blank),
+            (jnp.asarray(0, jnp.int32), nothing, blank),
         )
+        end = self._finished(fixed, end, annealing, least_after_fitting(found))
         followed = eqx.Partial(followed_width, scale)
         end = gauss_newton_gradients(graph, end, gaussian_trust, followed)
         return solution_of(graph, _or_start(graph, end, T_start))
+
+    def _finished(
+        self, graph: PoseGraph, end: Iterated, annealing: WidthOf, least: Array
+    ) -> Iterated:
+        """The last digits, at widths that settle.
+
+        Unless that blurs: likelihood falls below the least. Then as before.
+        """
+        start = graph, end.T_world_i, end.width
+        settled = self._steps(
+            *start, settled_width(graph.length_scale, end.width), self.tolerance
+        )
+        blurs = explained(graph, settled.T_world_i).log_ratio < least
+        enough = jnp.where(blurs, self.tolerance, jnp.inf)  # no step if it does not
+        annealed = self._steps(*start, annealing, enough)
+        last = jax.tree.map(lambda a, b: jnp.where(blurs, a, b), annealed, settled)
+        return going_on(end, last)
+
+    def _steps(
+        self,
+        graph: PoseGraph,
+        T_start: Array,
+        width: Array,
+        width_of: WidthOf,
+        tolerance: Array | float,
+    ) -> Iterated:
+        return iterate(
+            graph,
+            T_start,
+            width,
+            width_of,
+            gaussian_trust,
+            gauss_newton_step,
+            max_steps=self.max_steps,
+            tolerance=tolerance,
+        )
 
     @kept_program
     def _large(
@@ -142,11 +186,12 @@ class Correntropy(AbstractAverager):
         near = without_lone_closures(jax.lax.stop_gradient(graph))
         if init is None:
             T_start = starting_poses(self.initialiser, near, None, key)
-            starts = [_better_start(graph, T_start, near), along_frames(graph)]
+            better, _ = _better_start(graph, T_start, near)
+            starts = [better, along_frames(graph)]
         else:
             # A start of the caller's may be far off: plain steps that leave out what
             # pulls against them would bend it for good.
-            starts = [_better_start(graph, init, graph)]
+            starts = [_better_start(graph, init, graph)[0]]
         end = graduated(graph, near, jnp.stack(starts), self.max_steps)
         return solution_of(graph, end)
 
@@ -169,8 +214,8 @@ def _better_start(
     graph: PoseGraph,
     T_start: Float[Array, "v D D"],
     near: PoseGraph,
-) -> Float[Array, "v D D"]:
-    """The start, or what a few plain steps make of it if that is likelier.
+) -> tuple[Float[Array, "v D D"], Explained]:
+    """The start, or what a few plain steps make of it if that is likelier; how likely.
 
     A chain of good edges drifts: its loop closures then look wrong, and a redescending
     kernel would drop them. Plain averaging spreads the drift; with wrong edges about,
@@ -178,5 +223,6 @@ def _better_start(
     """
     plain = iterate_plain(near, T_start, RootRows(), max_steps=5, tolerance=1e-2)
     both = jnp.stack([T_start, plain.T_world_i])
-    ratio = jax.lax.map(lambda T: explained(graph, T).log_ratio, both)
-    return jnp.where(ratio[1] > ratio[0], both[1], both[0])
+    found = jax.lax.map(lambda T: explained(graph, T), both)
+    best = jnp.where(found.log_ratio[1] > found.log_ratio[0], 1, 0)
+    return both[best], jax.tree.map(lambda x: x[best], found)

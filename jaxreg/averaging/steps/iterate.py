@@ -48,6 +48,26 @@ class Iterated(NamedTuple):
     trace: AveragingTrace
 
 
+def going_on(first: Iterated, then: Iterated) -> Iterated:
+    """The second end, with the steps of both, as far as there is room for them."""
+    num, room = first.num_steps, len(first.trace.change)
+
+    def both(a: Array, b: Array) -> Array:
+        at = jnp.arange(room) - num
+        later = (at >= 0).reshape(-1, *[1] * (a.ndim - 1))
+        return jnp.where(later, b[jnp.maximum(at, 0)], a)
+
+    num_steps = jnp.minimum(num + then.num_steps, room)
+    one, two = first.trace, then.trace
+    trace = AveragingTrace(
+        num_steps,
+        both(one.change, two.change),
+        both(one.kernel_width, two.kernel_width),
+        both(one.trust, two.trust),
+    )
+    return then._replace(num_steps=num_steps, trace=trace)
+
+
 def solution_of(graph: PoseGraph, end: Iterated) -> AveragingSolution:
     """The solution where the loop stopped."""
     return solution(
