@@ -30,6 +30,11 @@ _AT_TERMINAL = {
     Status.TOO_FEW_POINTS: (
         "Fewer distinct finite points than d + 1. Check the file with jaxreg info."
     ),
+    Status.DISCONNECTED: (
+        "Not all hang together by motions that are trusted: those that do with the "
+        "first, or the most, are placed, others in parts of their own. Add scans "
+        "between them, or motions that you know (jaxreg average --force I,J)."
+    ),
     Status.UNIT_DIFFERS: (
         "The scan is more than 50 times larger or smaller than the other or others, "
         "and does not fit. Is it in another unit? Name both: register --unit mm m."

@@ -10,6 +10,7 @@ from jaxreg.io.errors import InputError
 from jaxreg.io.extras import require
 from jaxreg.io.files import reading, require_regular
 from jaxreg.io.moved.write import write_moved
+from jaxreg.io.points.arrays import npz_keys
 from jaxreg.io.points.e57 import scan_names
 from jaxreg.io.points.read import (
     ARCHIVES,
@@ -70,8 +71,7 @@ def keys_of(path: Path) -> list[str]:
     """The names of the scans of an archive."""
     with reading(path, suffix_of(path)[1:].upper()):
         if suffix_of(path) == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                return list(archive.files)
+            return npz_keys(path)[0]
         with require("pye57", "Reading E57").E57(str(path)) as file:
             return scan_names(file)
 

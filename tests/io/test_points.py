@@ -213,11 +213,24 @@ def test_bad_files_are_named_in_two_lines(tmp_path: Path, kind: str):
 )
 def test_bad_arrays_are_named(tmp_path: Path, array: np.ndarray):
     np.save(tmp_path / "a.npy", array)
-    np.savez(tmp_path / "b.npz", good=CLOUD, bad=array)
+    np.savez(tmp_path / "b.npz", bad=array)
+    np.savez(tmp_path / "c.npz", good=CLOUD, bad=array)
     with pytest.raises(InputError, match=r"a\.npy"):
         read_points(tmp_path / "a.npy")
     with pytest.raises(InputError, match=r"b\.npz:bad"):
         read_scans(tmp_path / "b.npz")
+    with pytest.raises(InputError, match=r"c\.npz:bad"):
+        read_points(f"{tmp_path}/c.npz:bad")
+    np.testing.assert_array_equal(read_points(f"{tmp_path}/c.npz:good"), CLOUD)
+
+
+def test_arrays_beside_the_scans_are_skipped_with_a_note(tmp_path: Path):
+    others = {"T_world_i": np.eye(4)[None], "unit": "m", "voxel": 0.1}
+    np.savez(tmp_path / "a.npz", one=CLOUD, **others)
+    with pytest.warns(UserWarning, match="skipped: T_world_i, unit, voxel"):
+        names, _ = read_scans(tmp_path / "a.npz")
+    assert names == ["one"]
+    np.testing.assert_array_equal(read_points(tmp_path / "a.npz"), CLOUD)
 
 
 def test_pickles_are_refused(tmp_path: Path):

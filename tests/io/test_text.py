@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxreg.io import InputError, read_points
+from jaxreg.io.points.read import read_named
 
 
 POINTS = [[1.5, 2.5, 3.5], [4.5, 5.5, 6.5]]
@@ -37,6 +38,26 @@ def test_what_is_meant_is_read(tmp_path: Path, kind: str):
     path = tmp_path / "a.txt"
     path.write_bytes(MEANT[kind].encode())
     np.testing.assert_array_equal(read_points(path), POINTS)
+
+
+@pytest.mark.parametrize(
+    ("colors", "fields"),
+    [
+        ("9 120 255", ("x", "y", "z", "red", "green", "blue")),
+        ("0 0 1", ()),  # normals as likely
+        ("9 120 256", ()),
+        ("0.5 0.2 1", ()),
+        ("9 120 255 3", ()),
+    ],
+)
+def test_colours_without_names_are_known_by_their_values(
+    tmp_path: Path, colors: str, fields: tuple[str, ...]
+):
+    path = tmp_path / "a.xyz"
+    path.write_text(f"1.5 2.5 3.5 {colors}\n4.5 5.5 6.5 {colors}\n")
+    found = read_named(path)["a"]
+    assert found.fields == fields
+    np.testing.assert_array_equal(found.points, POINTS)
 
 
 def test_utf_16_is_text(tmp_path: Path):

@@ -25,12 +25,30 @@ def run(command: Apply) -> int:
         motions = {k: np.linalg.inv(T) for k, T in motions.items()}
     with held(command.out), atomic_folder(command.out) as staging:
         written = write_aligned(staging, scans, motions)
+        _require_originals_kept(command.out, written, scans)
     if not command.quiet:
         left = [scan.name for k, scan in enumerate(scans) if k not in motions]
         lines = [f"{name}: has no pose, left out." for name in left]
         lines.append(f"Written to {command.out}: {', '.join(written)}.")
         sys.stdout.write(printable("\n".join(lines)) + "\n")
     return 0
+
+
+def _require_originals_kept(
+    out: Path, written: list[str], scans: list[ScanFile]
+) -> None:
+    """Refuses to put moved scans in place of those that were read.
+
+    Raises:
+        InputError: where a file that was read would be replaced.
+    """
+    read = {scan.file.resolve() for scan in scans}
+    for name in written:
+        if (out / name).resolve() in read:
+            raise InputError(
+                f"{out / name}: is a scan that is read; it would be replaced.\n"
+                "Give another folder: --out FOLDER."
+            )
 
 
 def precise_poses(path: Path) -> Trajectory:

@@ -12,7 +12,7 @@ from rich.table import Table
 from jaxreg._core.status import Status
 from jaxreg.app.advice import terminal_advice
 from jaxreg.app.cli import outputs
-from jaxreg.app.cli.by_hand import forced, left_out, motions_between, pairs_of
+from jaxreg.app.cli.by_hand import forced, left_out, motions_between, pairs_of, rooted
 from jaxreg.app.cli.known import (
     is_told,
     known_entries,
@@ -68,6 +68,10 @@ def run(command: Average, session: Session) -> int:
         dropped = motions_between(command.drop, graph, ids, "--drop")
         right = motions_between(command.force, graph, ids, "--force")
     graph = left_out(graph, dropped)
+    if not is_told(known):
+        graph, ids, note = rooted(graph, ids)
+        if note:
+            session.console.print(note)
     for message in {str(w.message) for w in caught}:
         session.console.print(message)
     key = key_of(command)
@@ -221,7 +225,8 @@ def _show(
     session: Session, graph: PoseGraph, sol: AveragingSolution, objective: list[float]
 ) -> None:
     status = Status(int(sol.status))
-    table = Table(title=f"{graph.num_poses} poses, {graph.num_edges} edges")
+    num_edges = int(graph.mask.sum())
+    table = Table(title=f"{graph.num_poses} poses, {num_edges} edges")
     table.add_column("poses")
     table.add_column("objective", justify="right")
     table.add_row("before (spanning tree)", f"{objective[0]:.8g}")
@@ -231,7 +236,7 @@ def _show(
     trusted = int(np.sum(np.asarray(sol.edge_weight) > 0.5))
     session.console.print(
         f"{status.name}: {int(placed.sum())} of {len(placed)} poses placed, {trusted} "
-        f"of {graph.num_edges} edges trusted, {int(sol.num_steps)} steps."
+        f"of {num_edges} edges trusted, {int(sol.num_steps)} steps."
     )
     if status != Status.CONVERGED:
         session.console.print(terminal_advice(status))
@@ -259,8 +264,13 @@ def _show_residuals(session: Session, report: EdgeReport, ids: np.ndarray) -> No
             f"{report.redundancy[row]:.2f}",
         )
     session.console.print(table)
+    if report.degrees_of_freedom > 0:
+        told = (
+            f"Chi-square {report.chi_square:.6g}, {report.degrees_of_freedom} degrees "
+            f"of freedom, variance factor {report.variance_factor:.4g}."
+        )
+    else:
+        told = "No motion is to spare, so nothing checks the others."
     session.console.print(
-        f"Chi-square {report.chi_square:.6g}, {report.degrees_of_freedom} degrees of "
-        f"freedom, variance factor {report.variance_factor:.4g}. Normalised: in "
-        "standard deviations; r: redundancy number."
+        f"{told} Normalised: in standard deviations; r: redundancy number."
     )

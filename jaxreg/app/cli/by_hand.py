@@ -6,6 +6,8 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from jaxreg.averaging import AveragingSolution, PoseGraphLM, average
 from jaxreg.graph.pose_graph import PoseGraph
@@ -37,6 +39,30 @@ def left_out(graph: PoseGraph, rows: np.ndarray) -> PoseGraph:
     kept = jnp.asarray(np.asarray(graph.mask) & ~rows)
     weight = jnp.where(kept, graph.weight, 0)
     return eqx.tree_at(lambda g: (g.mask, g.weight), graph, (kept, weight))
+
+
+def rooted(graph: PoseGraph, ids: np.ndarray) -> tuple[PoseGraph, np.ndarray, str]:
+    """Frames so numbered that the largest part that hangs together has frame 0.
+
+    Returns:
+        The graph, the names of its frames, and what to tell of it, empty as a rule.
+    """
+    edges, num = np.asarray(graph.edges), graph.num_poses
+    used = edges[np.asarray(graph.mask)]
+    joined = sparse.coo_array((np.ones(len(used)), used.T), (num, num))
+    part = connected_components(joined, directed=False)[1]
+    sizes = np.bincount(part)
+    if sizes[part[0]] == sizes.max():
+        return graph, ids, ""
+    largest = part == sizes.argmax()
+    order = np.concatenate([np.flatnonzero(largest), np.flatnonzero(~largest)])
+    number = np.argsort(order)
+    moved = eqx.tree_at(lambda g: g.edges, graph, jnp.asarray(number[edges]))
+    note = (
+        f"The part of frame {ids[0]} has {sizes[part[0]]} of the frames, that of frame "
+        f"{ids[order[0]]} has {sizes.max()}: poses are in the frame of the latter."
+    )
+    return moved, ids[order], note
 
 
 def forced(

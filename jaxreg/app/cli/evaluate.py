@@ -28,6 +28,10 @@ def run(command: Evaluate) -> int:
         raise InputError(f"--delta {command.delta}: wanted at least 1.")
     with jax.enable_x64(True):
         found, truth = map(read_trajectory, (command.estimate, command.truth))
+        if (len(found.T_world_i), len(truth.T_world_i)) == (2, 1):
+            # The result of `register`, and one matrix: of the source in the target.
+            pair = PoseGraph.from_edges([(0, 1)], truth.T_world_i)
+            truth = truth._replace(pairs=pair)
         if truth.pairs is not None:
             document, figure = _pairs(command, found, truth.pairs)
         elif found.pairs is not None:
@@ -54,6 +58,11 @@ def _poses(
     """What is told of poses, and its picture."""
     rows, true_rows, labels = _common(command, found, truth)
     T, T_true = found.T_world_i[rows], truth.T_world_i[true_rows]
+    if command.delta >= len(rows):
+        raise InputError(
+            f"--delta {command.delta}: wanted less than the {len(rows)} frames that "
+            "both have."
+        )
     if T.shape != T_true.shape:
         raise InputError(
             f"{command.estimate}: is {T.shape[-1] - 1}D, but {command.truth} is "

@@ -10,7 +10,7 @@ from typing import Any
 from jaxreg.app.cli.options import Info
 from jaxreg.app.describe import GRAPHS, GraphFacts, ScanFacts, describe, unit_notes
 from jaxreg.io.errors import InputError, MissingExtraError
-from jaxreg.io.points.read import point_files, prose_files
+from jaxreg.io.points.read import notes_on_skipped, point_files, prose_files
 from jaxreg.io.printable import printable
 
 
@@ -37,8 +37,12 @@ def run(command: Info) -> int:
         if not isinstance(facts, GraphFacts)
         for scan in facts
     ]
-    skipped = [f for place in command.files for f in prose_files(place)]
-    notes = [f"{file}: holds no points, skipped." for file in skipped]
+    read = [file for file, facts in found if not isinstance(facts, GraphFacts)]
+    folders = [place for place in command.files if place.is_dir()]
+    notes = [
+        f"{f}: holds no points, skipped." for one in folders for f in prose_files(one)
+    ]
+    notes += [note for file in read for note in notes_on_skipped(file)]
     notes += unit_notes(scans)
     if command.json:
         files = [_entry(file, facts) for file, facts in found]

@@ -14,8 +14,8 @@ from jaxreg.cloud import OTHER_UNIT
 from jaxreg.io.errors import InputError
 from jaxreg.io.points.attributes import read_attributes
 from jaxreg.io.points.read import (
+    notes_on_skipped,
     point_files,
-    prose_files,
     read_named,
     unique_names,
 )
@@ -67,12 +67,18 @@ class Scans:
         return moved, np.stack(middles)
 
 
-def load_scans(paths: Sequence[Path], units: Sequence[float] | None = None) -> Scans:
+def load_scans(
+    paths: Sequence[Path],
+    units: Sequence[float] | None = None,
+    *,
+    any_size: bool = False,
+) -> Scans:
     """Reads the scans of a command line and refuses what cannot be registered.
 
     Args:
         paths: files, folders, archives.
         units: a factor for each path, which its coordinates are multiplied by.
+        any_size: the scans may be of any sizes, as their scale is looked for.
 
     Raises:
         InputError: if a file cannot be read, there are fewer than two scans, 2D and 3D
@@ -87,7 +93,7 @@ def load_scans(paths: Sequence[Path], units: Sequence[float] | None = None) -> S
     fields: list[tuple[str, ...]] = []
     steps: list[int] = []
     for path, unit in zip(paths, units or [1.0] * len(paths), strict=True):
-        notes += [f"{file}: holds no points, skipped." for file in prose_files(path)]
+        notes += notes_on_skipped(path)
         found = [
             (file, *item)
             for file in point_files(path)
@@ -112,7 +118,8 @@ def load_scans(paths: Sequence[Path], units: Sequence[float] | None = None) -> S
     scans = Scans(names, points, places, *more)
     _require_two(scans)
     _require_one_dimension(scans)
-    _require_one_unit(scans)
+    if not any_size:
+        _require_one_unit(scans)
     for place, array in zip(scans.places, scans.points, strict=True):
         _require_points(place, array)
     return scans
@@ -161,14 +168,19 @@ def _require_one_dimension(scans: Scans) -> None:
 
 def _require_one_unit(scans: Scans) -> None:
     extents = np.array([_extent(x) for x in scans.points])
-    usual = np.median(extents)
+    usual = np.median(extents) if len(extents) > 2 else extents.max()
     for place, extent in zip(scans.places, extents, strict=True):
         ratio = extent / usual if usual > 0 else 1.0
         if ratio > OTHER_UNIT or 0 < ratio < 1 / OTHER_UNIT:
+            if len(extents) == 2:
+                others = f"the other {usual:.4g}"
+                advice = "Name both units: register --unit mm m."
+            else:
+                others = f"the others about {usual:.4g}"
+                advice = "Scale it to the unit of the others, or leave it out."
             raise InputError(
-                f"{place}: spans {extent:.4g}, the others about {usual:.4g}: is it in "
-                "another unit?\nScale it to the unit of the others (of two scans: "
-                "register --unit mm m), or leave it out."
+                f"{place}: spans {extent:.4g}, {others}: is it in another unit?\n"
+                f"{advice}"
             )
 
 

@@ -25,7 +25,9 @@ def run(command: Register, session: Session) -> int:
     command.check_model()
     units = _units(command)
     with session.timed("read"):
-        scans = load_scans([command.target, command.source], units)
+        scans = load_scans(
+            [command.target, command.source], units, any_size=command.scale
+        )
     if len(scans.names) != 2:
         raise InputError(
             f"{command.target} and {command.source}: hold {len(scans.names)} scans.\n"
@@ -55,6 +57,11 @@ def run(command: Register, session: Session) -> int:
         who = f"{command.source} onto {command.target}: {result.status.name}"
         return outputs.tell_failure(session, result, who, result.status)
     _show(session, result, f" {command.unit[1]}" if command.unit else "")
+    if command.method != "filter" and command.init is None:
+        session.console.print(
+            f"{command.method} began where the middles meet and goes to the nearest "
+            "fit, right or wrong: give a guess (--init), or leave --method out."
+        )
     return 0
 
 

@@ -17,6 +17,7 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 _LONGEST_HEADER = 10_000
+_SAVE_NPZ = "Save it with numpy.savez(file, name=points, ...)."
 # Of DEFLATE; a header that promises more lies.
 _MOST_RATIO = 1100
 
@@ -52,31 +53,79 @@ def parse_npy(
 
 
 def parse_npz(
-    path: Path, step: Step = every_row
+    path: Path, step: Step = every_row, only: str | None = None
 ) -> dict[str, tuple[np.ndarray, tuple[str, ...], int]]:
-    """The arrays of an NPZ file by key, each as `parse_npy` has it.
+    """The scans of an NPZ file by key, each as `parse_npy` has it.
 
     They are read by blocks, of which only the rows that are kept stay in memory.
 
+    Args:
+        path: the file.
+        step: tells from the number of rows which of them to keep.
+        only: the key of the one to read; else all whose shape is that of a scan.
+
     Raises:
-        InputError: if an array is none of points, or there is none.
+        InputError: if an array that is read is none of points, or there is none.
     """
     arrays: dict[str, tuple[np.ndarray, tuple[str, ...], int]] = {}
-    with reading(path, "NPZ", "Save it with numpy.savez(file, name=points, ...)."):
-        with zipfile.ZipFile(path) as archive:
-            for info in archive.infolist():
-                key = info.filename.removesuffix(".npy")
-                if key in arrays:
-                    raise ValueError(f"two arrays are called {key}")
-                if info.file_size > _MOST_RATIO * (info.compress_size + 100):
-                    raise ValueError(f"{key} says that it has {info.file_size} bytes")
-                with archive.open(info) as file:
-                    name = f"{path}:{key}"
-                    points, every = _some_rows(file, info.file_size, name, step)
-                arrays[key] = points, (), every
+    with reading(path, "NPZ", _SAVE_NPZ), zipfile.ZipFile(path) as archive:
+        infos = _infos(archive)
+        if only is not None and only not in infos:
+            raise InputError(
+                f"{path}: has no scan {only}.\nIt holds: {some_of(list(infos))}."
+            )
+        keys = _scan_keys(archive, infos) if only is None else [only]
+        for key in keys or list(infos)[:1]:  # of no scan, the first says why
+            with archive.open(infos[key]) as file:
+                size, name = infos[key].file_size, f"{path}:{key}"
+                points, every = _some_rows(file, size, name, step)
+            arrays[key] = points, (), every
     if not arrays:
         raise InputError(f"{path}: holds no arrays.\nSave each scan under a name.")
     return arrays
+
+
+def npz_keys(path: Path) -> tuple[list[str], list[str]]:
+    """Of the arrays whose shape is that of a scan, and of all others.
+
+    Raises:
+        InputError: if it is no NPZ file.
+    """
+    with reading(path, "NPZ", _SAVE_NPZ), zipfile.ZipFile(path) as archive:
+        infos = _infos(archive)
+        scans = _scan_keys(archive, infos)
+    return scans, [key for key in infos if key not in scans]
+
+
+def some_of(names: list[str]) -> str:
+    """A dozen of them, for messages."""
+    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+
+
+def _infos(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """The members by key."""
+    infos: dict[str, zipfile.ZipInfo] = {}
+    for info in archive.infolist():
+        key = info.filename.removesuffix(".npy")
+        if key in infos:
+            raise ValueError(f"two arrays are called {key}")
+        if info.file_size > _MOST_RATIO * (info.compress_size + 100):
+            raise ValueError(f"{key} says that it has {info.file_size} bytes")
+        infos[key] = info
+    return infos
+
+
+def _scan_keys(
+    archive: zipfile.ZipFile, infos: dict[str, zipfile.ZipInfo]
+) -> list[str]:
+    """Poses, units and notes are often kept beside the scans: their shape tells."""
+    keys = []
+    for key, info in infos.items():
+        with archive.open(info) as file:
+            shape = _layout(file).shape
+        if len(shape) == 2 and shape[1] in (2, 3):
+            keys.append(key)
+    return keys
 
 
 def _some_rows(file: Any, size: int, name: str, step: Step) -> tuple[np.ndarray, int]:

@@ -29,8 +29,7 @@ _PARSERS = {
     ".obj": meshes.parse_obj,
     ".stl": meshes.parse_stl,
 }
-_ARCHIVE_READERS = {".npz": arrays.parse_npz, ".e57": e57.read_e57}
-ARCHIVES = tuple(_ARCHIVE_READERS)
+ARCHIVES = (".npz", ".e57")
 SUFFIXES = (*_PARSERS, *ARCHIVES, *TEXT)
 _NEVER_PACKED = (".npy", *ARCHIVES, "")
 _FORMATS = (
@@ -88,7 +87,7 @@ def read_points(path: str | Path) -> np.ndarray:
     scans = read_named(path)
     if len(scans) > 1:
         raise InputError(
-            f"{bare}: holds {len(scans)} scans: {_listing(scans)}.\n"
+            f"{bare}: holds {len(scans)} scans: {arrays.some_of(list(scans))}.\n"
             f"Name one of them, for example {bare}:{next(iter(scans))}"
         )
     return next(iter(scans.values())).points
@@ -103,7 +102,8 @@ def read_scans(
         paths: each is a file as for `read_points`, an NPZ or E57 file of which every
             scan is read, or a folder, of which all point files are read in natural
             order (`scan2` before `scan10`). Of text files there without points, such
-            as a readme or poses, a warning tells that they are skipped.
+            as a readme or poses, and of arrays that are no scans, a warning tells
+            that they are skipped.
 
     Returns:
         Names, made of file names without suffix or NPZ keys and unique, and as many
@@ -115,8 +115,8 @@ def read_scans(
     names: list[str] = []
     scans: list[np.ndarray] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
-        for file in prose_files(path):
-            warnings.warn(f"{file}: holds no points, skipped.", stacklevel=2)
+        for note in notes_on_skipped(path):
+            warnings.warn(note, stacklevel=2)
         for file in point_files(path):
             found = read_named(file)
             names += found.keys()
@@ -142,12 +142,13 @@ def read_named(
     if suffix_of(bare) not in ARCHIVES:
         return {stem(bare): _read_file(bare, max_points)}
     step = every_row if max_points is None else at_most(max_points)
-    found = _read_archive(bare, step)
+    found = _read_archive(bare, step, key)
     scans = {name: _thinned(scan, max_points) for name, scan in found.items()}
     if key is None and len(scans) == 1 and suffix_of(bare) == ".e57":
         return {stem(bare): next(iter(scans.values()))}  # scanners name all alike
     if key is not None and key not in scans:
-        raise InputError(f"{bare}: has no scan {key}.\nIt holds: {_listing(scans)}.")
+        listing = arrays.some_of(list(scans))
+        raise InputError(f"{bare}: has no scan {key}.\nIt holds: {listing}.")
     return scans if key is None else {key: scans[key]}
 
 
@@ -186,6 +187,17 @@ def prose_files(path: str | Path) -> list[Path]:
     found = [f for f in _candidates(Path(path)) if suffix_of(f) in TEXT]
     found = [f for f in found if f.stat().st_size or suffix_of(f) == ".txt"]
     return [f for f in found if not text.may_be_points(text_lines(f), f)]
+
+
+def notes_on_skipped(path: str | Path) -> list[str]:
+    """Which files of a folder and which arrays of an NPZ file are no scans."""
+    notes = [f"{file}: holds no points, skipped." for file in prose_files(path)]
+    for file in point_files(path):
+        if suffix_of(file) == ".npz" and file.is_file():
+            scans, others = arrays.npz_keys(file)
+            if scans and others:
+                notes.append(f"{file}: no scans, skipped: {arrays.some_of(others)}.")
+    return notes
 
 
 def _candidates(folder: Path) -> list[Path]:
@@ -233,11 +245,14 @@ def _thinned(scan: NamedPoints, max_points: int | None) -> NamedPoints:
     return scan._replace(points=points, step=step * scan.step)
 
 
-def _read_archive(path: Path, step: Step) -> dict[str, NamedPoints]:
+def _read_archive(path: Path, step: Step, key: str | None) -> dict[str, NamedPoints]:
     suffix = suffix_of(path)
     require_known(path, suffix)
     with reading(path, suffix[1:].upper()):
-        found = _ARCHIVE_READERS[suffix](path, step)
+        if suffix == ".npz":
+            found = arrays.parse_npz(path, step, key)
+        else:
+            found = e57.read_e57(path, step)
     return {name: NamedPoints(*scan) for name, scan in found.items()}
 
 
@@ -295,8 +310,3 @@ def unique_names(names: list[str]) -> list[str]:
         seen[name] = seen.get(name, 0) + 1
         out.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
     return out
-
-
-def _listing(scans: dict[str, NamedPoints]) -> str:
-    names = list(scans)
-    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")

@@ -24,6 +24,7 @@ from jaxreg.io.points.other_text import require_points
 
 
 _LOOK = 50  # rows that the layout is read from
+_X_Y_Z_COLORS = ("x", "y", "z", "red", "green", "blue")
 Line = tuple[int, str]
 
 
@@ -189,6 +190,7 @@ def _layout(
     if commented and len(names) != len(rows[0]):
         names = []  # a comment like any other
     columns, fields = coordinates(names, numeric, len(rows[0]), path)
+    fields = fields or _by_their_values(rows)
     _require_first_row(rows, columns, lines, path)
     needed = max(numeric) + 1
     return Layout(dialect, columns, fields, len(rows[0]), needed, count), lines
@@ -196,6 +198,17 @@ def _layout(
 
 def _has_numbers(line: str) -> bool:
     return sum(map(is_number, dialect_of([line]).cells(line))) >= 2
+
+
+def _by_their_values(rows: list[list[str]]) -> tuple[str, ...]:
+    """Names of six columns without any, of which three plainly are colours."""
+    if any(len(row) != 6 for row in rows):
+        return ()
+    cells = [cell for row in rows for cell in row[3:]]
+    if not all(cell.isascii() and cell.isdigit() for cell in cells):
+        return ()
+    # Of zeros and ones alone they may be normals.
+    return _X_Y_Z_COLORS if 1 < max(map(int, cells)) <= 255 else ()
 
 
 def _numeric_columns(rows: list[list[str]], lines: list[Line], path: Path) -> list[int]:

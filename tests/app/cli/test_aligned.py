@@ -53,6 +53,17 @@ def test_scans_are_saved_whole_in_the_common_frame(
     assert os.listdir("jaxreg-out/aligned") == []
 
 
+def test_scans_are_not_replaced_by_what_is_made_of_them(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    [name] = _save(folder)[:1]
+    np.savetxt("T.txt", POSES[1])
+    before = Path(name).read_bytes()
+    assert main(["apply", "T.txt", name, "--out", "."]) == 2
+    assert f"{name}: is a scan that is read" in capsys.readouterr().err
+    assert Path(name).read_bytes() == before
+
+
 def test_scans_of_other_models_are_in_folders_of_their_own(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -197,6 +197,21 @@ def test_recall_of_the_kitchen_by_the_counts_of_3dmatch(
     assert (told["num_right"], told["num_true"], told["num_found"]) == (383, 449, 531)
 
 
+def test_a_pair_is_compared_with_the_matrix_of_its_motion(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    _, true, found = trajectories()
+    poses = {"T_world_i": found[:2].tolist(), "names": ["target", "source"]}
+    Path("result.json").write_text(json.dumps(poses))
+    T_target_source = np.linalg.inv(true[0]) @ true[1]
+    np.savetxt("truth.txt", T_target_source)
+    told = _evaluate(capsys, "result.json", "truth.txt")
+    T = np.linalg.inv(found[0]) @ found[1]
+    assert told["num_pairs"] == [1, 1, 1]
+    expected = np.linalg.norm(T[:3, 3] - T_target_source[:3, 3])
+    np.testing.assert_allclose(told["e_t"]["mean"], expected, rtol=1e-9)
+
+
 def test_files_and_tables_tell_the_same(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -221,6 +236,7 @@ def test_files_and_tables_tell_the_same(
         (["late.tum", "true.tum"], "have 0 frames in common"),
         (["pairs.log", "true.tum"], "holds motions of pairs"),
         (["found.tum", "true.tum", "--delta", "0"], "--delta 0: wanted at least 1"),
+        (["found.tum", "true.tum", "--delta", "999"], "wanted less than the"),
         (["found.tum", "cut.txt"], "holds no poses that are read here"),
     ],
 )

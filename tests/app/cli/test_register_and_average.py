@@ -40,6 +40,31 @@ def test_register_writes_the_motion_between_the_files(
     assert "overlap 0.930" in capsys.readouterr().out
 
 
+def test_with_scale_scans_may_be_of_any_sizes(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    save_scans(folder)
+    np.save("mm.npy", 1000 * np.load("s1.npy"))
+    monkeypatch.setattr(jaxreg, "register", register_s1_onto_s0)
+    assert main(["register", "mm.npy", "s0.npy"]) == 2
+    assert main(["register", "mm.npy", "s0.npy", "--method", "icp", "--scale"]) == 0
+    assert "give a guess (--init)" in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_largest_part_of_a_graph_is_placed(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    Path("g.g2o").write_text(GRAPH)
+    assert main(["average", "g.g2o", "--drop", "0,1", "0,2"]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "that of frame 1 has 2: poses are in the frame of the latter" in out
+    assert "2 of 3 poses placed" in out
+    found = json.loads(Path("jaxreg-out/result.json").read_text())
+    assert found["names"] == [1, 2, 0]
+    assert found["T_world_i"][2] is None
+    np.testing.assert_allclose(np.array(found["T_world_i"][1])[:2, 2], [1, 0])
+
+
 def test_a_position_is_that_of_the_origin_in_the_target(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
