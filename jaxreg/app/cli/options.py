@@ -201,6 +201,10 @@ class Multiview(ModelOptions, KnownOptions):
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
     ] = None
     """Lines NAME X Y [Z]: about where each scan's scanner stood; see --deviation."""
+    unit: Annotated[
+        Unit | None, tyro.conf.arg(metavar="UNIT", help_behavior_hint="(default: none)")
+    ] = None
+    """Of all scans, told beside lengths: mm, cm, m, km, in, ft."""
     resume: bool = False
     """Go on with the pairs that an interrupted run left in the output folder."""
     view: bool = False

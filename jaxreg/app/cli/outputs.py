@@ -159,8 +159,9 @@ def page_details(session: Session, document: dict[str, Any]) -> dict[str, Any]:
     unshown = ("seed", "quiet", "json", "out")
     settings = {k: _setting(v) for k, v in options.items() if k not in unshown}
     keys = ("command", "seed", "times_s", "versions")
-    # Of a pair: that of the target.
-    unit = (options.get("unit") or ("",))[-1]
+    unit = options.get("unit") or ""
+    if isinstance(unit, tuple):  # of a pair: that of the target
+        unit = unit[-1]
     return {k: document[k] for k in keys} | {"settings": settings, "unit": unit}
 
 

@@ -36,6 +36,15 @@ function inUnit(name) { return UNIT ? `${name} [${UNIT}]` : name; }
 
 function asLength(x, digits) { return UNIT ? `${number(x, digits)} ${UNIT}` : number(x, digits); }
 
+// Residuals, errors and deviations of scans in metres are told in millimetres.
+const [FINE, FINER] = UNIT === "m" ? ["mm", 1000] : [UNIT, 1];
+
+function inFine(name) { return FINE ? `${name} [${FINE}]` : name; }
+
+function fine(x, digits) { return number(typeof x === "number" ? FINER * x : x, digits); }
+
+function asFine(x, digits) { return FINE ? `${fine(x, digits)} ${FINE}` : fine(x, digits); }
+
 function $(id) { return document.getElementById(id); }
 
 function el(tag, attributes = {}, ...children) {

@@ -21,7 +21,8 @@ function curveLayout(curves, panels) {
     layout[`yaxis${id}`] = { type: panel.log ? "log" : "linear", gridcolor: theme("--line"), zeroline: false,
       exponentformat: "power", nticks: 6, ...(panel.log ? {} : { rangemode: "tozero" }) };
     const names = panel.lines.map(({ name }, n) => `<span style="color:${theme(LINE_COLORS[n])}">${name}</span>`);
-    const text = panel.title.replace("unit of the input", UNIT || "unit of the input") + (names.length > 1 ? `: ${names.join(", ")}` : "");
+    const title = panel.title + (names.length > 1 ? `: ${names.join(", ")}` : "");
+    const text = title.replace(/\[unit( of the input)?\]/, `[${UNIT || "unit of the input"}]`);
     layout.annotations.push({ text, showarrow: false, xref: `x${id} domain`, yref: `y${id} domain`,
       x: 0, y: 1, yanchor: "bottom", xanchor: "left", font: { color: theme("--ink"), size: 12 } });
   });

@@ -75,10 +75,10 @@ function startPairs() {
     "A click shows the two scans alone.";
   if (DATA.scans.length > 2 && DATA.scans.length <= 120) ring();
   const rows = [...DATA.pairs].sort((a, b) => b.weight - a.weight || b.overlap - a.overlap);
-  $("pairs-table").append(table(["pair", "overlap", "weight", inUnit("inlier RMSE"), inUnit("off by"), "off by [°]"],
+  $("pairs-table").append(table(["pair", "overlap", "weight", inFine("inlier RMSE"), inFine("off by"), "off by [°]"],
     rows.slice(0, 500).map((p) => ({
       cells: [`${DATA.scans[p.i].name} – ${DATA.scans[p.j].name}`, p.overlap.toFixed(2),
-        p.weight.toFixed(2), number(p.rmse, 3), number(p.distance, 3), fixed(degrees(p.angle), 3)],
+        p.weight.toFixed(2), fine(p.rmse, 3), fine(p.distance, 3), fixed(degrees(p.angle), 3)],
       onclick: () => showPair(p),
     }))));
 }

@@ -123,7 +123,7 @@ function drawSlab() {
     const { at, width } = cutRange();
     const { origin } = arranged("after");
     $("cut-at").textContent =
-      `${AXES[state.axis]} = ${asLength(at + origin[state.axis], 3)}, ${asLength(width, 2)} thick`;
+      `${AXES[state.axis]} = ${asLength(at + origin[state.axis], 3)}, ${asFine(width, 2)} thick`;
     Plotly.react("slab", slabTraces(), slabLayout(), CONFIG);
   });
 }

@@ -39,8 +39,8 @@ function posesTable() {
   const turns = FLAT ? ["angle [°]"] : names.map((a) => `r${a} [°]`);
   const heads = [SCANS ? "scan" : "frame", ...(withStatus ? ["status"] : []),
     ...names.map((a) => inUnit(`t${a}`)), ...turns,
-    ...(withSigma ? [inUnit("σ position"), "σ angle [°]"] : []),
-    ...(withErrors ? [inUnit("error t"), "error R [°]"] : [])];
+    ...(withSigma ? [inFine("σ position"), "σ angle [°]"] : []),
+    ...(withErrors ? [inFine("error t"), "error R [°]"] : [])];
   const body = rows.map((s) => {
     const name = el("span", {}, ...(s.color
       ? [el("span", { class: "dot", style: `background:${rgb(s.color)}` })] : []), s.name);
@@ -48,12 +48,12 @@ function posesTable() {
     const r = isPlaced(s) ? turnOf(s.T).map((x) => x.toFixed(3)) : turns.map(() => "–");
     const status = s.status + (isPlaced(s) ? s.component ? `, component ${s.component}` : "" : ", not placed");
     return { title: s.name, cells: [name, ...(withStatus ? [status] : []), ...t, ...r,
-      ...(withSigma ? [number(s.sigma[0], 2), fixed(degrees(s.sigma[1]), 4)] : []),
-      ...(withErrors ? [number(s.e_t, 3), fixed(degrees(s.e_R), 4)] : [])] };
+      ...(withSigma ? [fine(s.sigma[0], 2), fixed(degrees(s.sigma[1]), 4)] : []),
+      ...(withErrors ? [fine(s.e_t, 3), fixed(degrees(s.e_R), 4)] : [])] };
   });
   if (withErrors) {
     body.push({ cells: ["mean", ...heads.slice(1, -2).map(() => ""),
-      number(DATA.errors.mean_e_t, 3), fixed(degrees(DATA.errors.mean_e_R), 4)] });
+      fine(DATA.errors.mean_e_t, 3), fixed(degrees(DATA.errors.mean_e_R), 4)] });
   }
   const more = SCANS || DATA.num_poses <= rows.length ? ""
     : ` The first ${rows.length} of ${DATA.num_poses}; poses.tum holds all.`;
@@ -81,10 +81,10 @@ function header() {
       if (NUM_MODELS > 1) tile(NUM_MODELS, "components, each in a frame of its own", "warn");
     } else if (DATA.pairs.length) {
       tile(number(DATA.pairs[0].overlap, 3), "overlap");
-      tile(asLength(DATA.pairs[0].rmse, 3), "inlier RMSE");
+      tile(asFine(DATA.pairs[0].rmse, 3), "inlier RMSE");
     }
     if (DATA.errors) {
-      tile(asLength(DATA.errors.mean_e_t, 3), "mean error of position");
+      tile(asFine(DATA.errors.mean_e_t, 3), "mean error of position");
       tile(`${number(degrees(DATA.errors.mean_e_R), 3)}°`, "mean error of rotation");
     }
   } else {

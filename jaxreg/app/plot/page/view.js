@@ -284,7 +284,7 @@ function showScale() {
   box.append(
     "to the nearest point of the other scans: 0",
     el("i", { style: `background:linear-gradient(90deg,${stops})` }),
-    asLength(DATA.points.far, 3),
+    asFine(DATA.points.far, 3),
     el("em"), "farther",
   );
 }
