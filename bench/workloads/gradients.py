@@ -8,6 +8,7 @@ Errors of a sensor move all points of both clouds: two noisy ones of 300 points,
 rigid motion alone would prove nothing about normals, widths and spacings.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -113,30 +114,36 @@ def _sensed_pairs() -> Iterator[Case]:
 
 
 def _icp() -> Case:
-    pair = draw(load(None), 500, 0)
+    method, pair = jr.ICP(), draw(load(None), 500, 0)
     source, target = (x.astype(np.float64) for x in (pair.source, pair.target))
 
-    def register(x: jax.Array | np.ndarray) -> jax.Array:
+    def register(
+        x: jax.Array | np.ndarray, method: AbstractRegistrar = method
+    ) -> jax.Array:
         near = jnp.asarray(pair.T_target_source)
-        return jr.register(x, jnp.asarray(target), jr.ICP(), near).T_target_source
+        return jr.register(x, jnp.asarray(target), method, near).T_target_source
 
     # Of a twist of the source. Cells that normals are taken from keep the axes, so the
     # answer follows by the twist's inverse but for 0.3 %.
     twist = np.zeros((4, 4))
     twist[:3] = [[0, -0.3, 0.2, 0.05], [0.3, 0, -0.5, 0.02], [-0.2, 0.5, 0, -0.03]]
     direction = source @ twist[:3, :3].T + twist[:3, 3]
-    programs = _programs(register, (4, 4))
+    through = partial(register, method=_through_the_steps(method))
+    programs = _programs(register, (4, 4), through)
     ends = (programs[0](jnp.asarray(source + s * _STEP * direction)) for s in (1, -1))
     there, back = map(np.asarray, ends)
     slope = (there - back) / (2 * _STEP)
     return _case("ICP, 500 points, by the source", programs, source, direction, slope)
 
 
-#: The answer, and the gradient of the loss.
-_Programs = tuple[
-    Callable[[jax.Array], jax.Array],
-    Callable[[jax.Array], jax.Array],
-]
+#: The answer, and the gradient of the loss; of some methods that through all steps.
+_Programs = tuple[Callable[[jax.Array], jax.Array], ...]
+
+
+def _through_the_steps(method: jr.ICP) -> jr.ICP:
+    """Differentiated as what records each operation does it: step by step, all kept."""
+    steps = jr.RecursiveCheckpointAdjoint(checkpoints=method.max_steps)
+    return dataclasses.replace(method, adjoint=steps)
 
 
 def _weights(shape: tuple[int, ...]) -> np.ndarray:
@@ -144,11 +151,15 @@ def _weights(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _programs(
-    answer: Callable[[jax.Array], jax.Array], shape: tuple[int, ...]
+    answer: Callable[[jax.Array], jax.Array],
+    shape: tuple[int, ...],
+    through: Callable[[jax.Array], jax.Array] | None = None,
 ) -> _Programs:
-    weights = _weights(shape)
-    gradient = jax.grad(lambda x: jnp.sum(weights * answer(x)))
-    return eqx.filter_jit(answer), eqx.filter_jit(gradient)
+    def gradient(of: Callable[[jax.Array], jax.Array]) -> Callable:
+        return eqx.filter_jit(jax.grad(lambda x: jnp.sum(_weights(shape) * of(x))))
+
+    programs = eqx.filter_jit(answer), gradient(answer)
+    return programs if through is None else (*programs, gradient(through))
 
 
 def _case(
@@ -158,13 +169,18 @@ def _case(
     direction: np.ndarray,
     slope: np.ndarray,
 ) -> Case:
-    weights, (forward, gradient) = _weights(slope.shape), programs
+    weights = _weights(slope.shape)
+    told = {
+        "jaxreg, the answer": "forward",
+        "jaxreg, gradient": "jax.grad",
+        "through the steps": "jax.grad, each step kept",
+    }
     return Case(
         name=name,
         data="generated",
         methods=[
-            Method("jaxreg, the answer", "jaxreg", "forward", partial(_call, forward)),
-            Method("jaxreg, gradient", "jaxreg", "jax.grad", partial(_call, gradient)),
+            Method(method, "jaxreg", how, partial(_call, program))
+            for (method, how), program in zip(told.items(), programs, strict=False)
         ],
         trials=[(jnp.asarray(x),)],
         judge=partial(judge, direction, float(np.sum(weights * slope))),
