@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,7 +87,7 @@ def test_pose_and_scale_follow_clouds_and_width_by_the_balance_of_pulls():
 def test_a_truncated_descent_follows_its_guess_and_every_step():
     source, target, guess = _clouds(2)
     rng = np.random.default_rng(1)
-    apart = rng.standard_normal((N, 2))
+    apart, carried = rng.standard_normal((2, N, 2))
     method = jr.ICP(
         POINTS,
         Cauchy(),
@@ -97,9 +98,24 @@ def test_a_truncated_descent_follows_its_guess_and_every_step():
 
     def value(x):
         start = guess.at[0, 2].add(x[1])
-        return _answer(_solve(method, source + x[0] * apart, target, start))
+        moved = source + x[0] * apart, target + x[2] * carried
+        return _answer(_solve(method, *moved, start))
 
-    _check_slopes(value, 2)
+    _check_slopes(value, 3)
+
+
+def test_both_adjoints_agree_where_the_descent_has_converged():
+    """In the frames of `register`, whose radius is the target's."""
+    source, target, guess = _clouds(2)
+
+    def slope(adjoint):
+        method = jr.ICP(POINTS, Cauchy(), max_steps=60, tolerance=0.0, adjoint=adjoint)
+        by = lambda x, y: _answer(jr.register(x, y, method, guess))  # noqa: E731
+        return jax.jit(jax.grad(by, argnums=(0, 1)))(source, target)
+
+    implicit = slope(jr.ImplicitAdjoint())
+    through = slope(jr.RecursiveCheckpointAdjoint())
+    chex.assert_trees_all_close(through, implicit, rtol=1e-5, atol=1e-7)
 
 
 def _axes() -> jax.Array:

@@ -148,7 +148,10 @@ class ICP(AbstractRegistrar):
     def in_frames(self, frames: Frames) -> "ICP":
         """With the correspondence distance in radii."""
         radius = frames.radius
-        limit = jnp.asarray(self.max_correspondence_distance, radius.dtype) / radius
+        farthest = jnp.asarray(self.max_correspondence_distance, radius.dtype)
+        # The derivative of inf / radius times none is NaN.
+        limited = jnp.isfinite(farthest)
+        limit = jnp.where(limited, jnp.where(limited, farthest, 1) / radius, jnp.inf)
         return eqx.tree_at(lambda m: m.max_correspondence_distance, self, limit)
 
     def prepare(self, points: Points, mask: Mask) -> PointCloud:
