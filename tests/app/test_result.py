@@ -7,6 +7,7 @@ import numpy as np
 import plyfile
 
 from jaxreg._core.status import Status
+from jaxreg.app.advice import terminal_advice
 from jaxreg.app.merge import merge_scans
 from jaxreg.app.result import (
     Result,
@@ -63,7 +64,7 @@ def test_result_json_says_everything(tmp_path: Path):
     np.testing.assert_array_equal(found["T_world_i"][1], result.T_world_i[1])
     assert found["T_world_i"][2] is None
     assert found["status"] == "DISCONNECTED"
-    assert found["advice"] == Status.DISCONNECTED.advice
+    assert found["advice"] == terminal_advice(Status.DISCONNECTED)
     assert (found["seed"], found["command"]) == (4, "jaxreg multiview x")
     assert found["times_s"] == {"run": 1.5}
     assert {"jaxreg", "jax", "numpy", "python", "device"} <= set(found["versions"])
