@@ -49,7 +49,7 @@ from jaxreg.graph.trees import along_frames
 from jaxreg.linear.laplacian import DENSE_LIMIT
 
 
-# Radians, and shares of the scene: so little is left to do.
+# Radians, and shares of the scene: so near annealing ends; settled widths do the rest.
 _NEARLY = 1e-3
 
 
