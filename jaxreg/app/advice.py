@@ -33,7 +33,8 @@ _AT_TERMINAL = {
     Status.DISCONNECTED: (
         "Not all hang together by motions that are trusted: those that do with the "
         "first, or the most, are placed, others in parts of their own. Add scans "
-        "between them, or motions that you know (jaxreg average --force I,J)."
+        "between them, or trust motions that you have looked at (jaxreg average "
+        "--force I,J)."
     ),
     Status.UNIT_DIFFERS: (
         "The scan is more than 50 times larger or smaller than the other or others, "
