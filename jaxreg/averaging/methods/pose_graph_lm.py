@@ -171,7 +171,7 @@ class PoseGraphLM(AbstractAverager):
         weight = stiffness / jnp.where(top > 0, top, 1)
         precondition = eqx.Partial(_nearly_balanced, graph.edges, Q)
         jacobian = eqx.Partial(edge_jacobian, self._imbalance)
-        return differentiable(graph, T, self._imbalance, weight, precondition, jacobian)
+        return differentiable(graph, T, self._imbalance, weight, jacobian, precondition)
 
     def _imbalance(self, graph: PoseGraph, T: Array) -> Array:
         force = self.problem(graph).normal(T)[1]

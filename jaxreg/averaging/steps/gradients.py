@@ -63,7 +63,7 @@ def _with_gradients(
 ) -> Iterated:
     imbalance = eqx.Partial(_imbalance, push, width_of, end.width)
     jacobian = eqx.Partial(_jacobian, push, width_of, end.width)
-    T = differentiable(graph, end.T_world_i, imbalance, weight, jacobian=jacobian)
+    T = differentiable(graph, end.T_world_i, imbalance, weight, jacobian)
     width = width_of(graph, T, end.width)
     return end._replace(T_world_i=T, trust=trust_of(graph, T, width), width=width)
 

@@ -19,7 +19,7 @@ from jaxreg.linear.small import product
 
 
 #: More of them are solved for by GMRES, which takes 200 products at most, one after the
-#: other; a dense matrix takes one for each unknown, side by side.
+#: other; a dense matrix takes a few for all edges, and memory by the square.
 DENSE_UNKNOWNS = 400
 
 
@@ -31,8 +31,8 @@ class _Balance(eqx.Module):
     fixed: Float[Array, "v D D"]
     free: Bool[Array, "v 1"]
     weight: Float[Array, " e"]
+    jacobian: Callable[[PoseGraph, Array], Array]
     precondition: Callable[[Array], Array] | None
-    jacobian: Callable[[PoseGraph, Array], Array] | None
 
     def residual(
         self, x: Float[Array, "v k"], T_world_i: Float[Array, "v D D"]
@@ -44,7 +44,7 @@ class _Balance(eqx.Module):
     def matrix(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, "n n"] | None:
         """The derivative of the residual by all tangents; None of a large graph."""
         num = len(T_world_i) * lie.tangent_dim(self.graph.dim)
-        if self.jacobian is None or num > DENSE_UNKNOWNS:
+        if num > DENSE_UNKNOWNS:
             return None
         free = jnp.repeat(self.free[:, 0], num // len(T_world_i))
         J = self.jacobian(self.graph, T_world_i)
@@ -52,8 +52,6 @@ class _Balance(eqx.Module):
 
     def solve(self, linear: Callable[[Array], Array], y: Array) -> Array:
         """X of linear(x) = y, the derivative of the residual or its transpose."""
-        if y.size <= DENSE_UNKNOWNS:
-            return _dense(linear, y)
         if self.precondition is not None:
             return _krylov(linear, y, self.precondition)
         return _krylov(linear, y, lambda r: solve_laplacian(*self._flow, -r))
@@ -68,8 +66,8 @@ def differentiable(
     T_world_i: Float[Array, "v D D"],
     imbalance: Callable[[PoseGraph, Array], Array],
     weight: Float[Array, " e"],
+    jacobian: Callable[[PoseGraph, Array], Array],
     precondition: Callable[[Array], Array] | None = None,
-    jacobian: Callable[[PoseGraph, Array], Array] | None = None,
 ) -> Float[Array, "v D D"]:
     """The same poses, with derivatives with respect to the values of the graph.
 
@@ -83,16 +81,16 @@ def differentiable(
             respect to left tangents of the poses is near to minus the Laplacian. It may
             hold values to differentiate, too.
         weight: `(e,)` Laplacian weights of at most 1; frames without any are held.
+        jacobian: the derivative of the imbalance by left tangents, `(v k, v k)`, at
+            given poses; asked of small graphs alone.
         precondition: maps `(v, k)` by about the inverse of that derivative, for graphs
             that are too large for a dense matrix; by default the inverse Laplacian.
-        jacobian: the derivative of the imbalance by left tangents, `(v k, v k)`, at
-            given poses of a small graph; by default one product for each unknown.
     """
     fixed, weight = jax.lax.stop_gradient((T_world_i, weight))
     i, j = graph.edges[:, 0], graph.edges[:, 1]
     touched = jnp.zeros(fixed.shape[:1], weight.dtype).at[i].add(weight)
     free = (touched.at[j].add(weight) > 0).at[0].set(False)[:, None]
-    parts = imbalance, fixed, free, weight, precondition, jacobian
+    parts = imbalance, fixed, free, weight, jacobian, precondition
     return _balanced(_Balance(graph, *parts))
 
 
@@ -121,12 +119,6 @@ def _balanced_jvp(primals: tuple[_Balance], tangents: tuple) -> tuple[Array, Arr
 
 def _solve(J: Float[Array, "n n"], _: Callable[[Array], Array], y: Array) -> Array:
     return jnp.linalg.solve(J, y.reshape(-1)).reshape(y.shape)
-
-
-def _dense(linear: Callable[[Array], Array], y: Array) -> Array:
-    eye = jnp.eye(y.size, dtype=y.dtype).reshape(-1, *y.shape)
-    columns = jax.vmap(linear)(eye).reshape(y.size, y.size)
-    return jnp.linalg.solve(columns.T, y.reshape(-1)).reshape(y.shape)
 
 
 def _krylov(
