@@ -15,6 +15,8 @@ PEERS = {
     "scipy": "scipy",
     "pykdtree": "pykdtree.kdtree",
     "jaxkd": "jaxkd",
+    "pypose": "pypose",
+    "theseus-ai": "theseus",
 }
 
 
