@@ -101,7 +101,7 @@ class Ascending(AbstractIteration[Motion, Ascent]):
         return Ascent(
             T=T,
             model=model,
-            trial=lie.orthonormalise(turn_and_shift(T, tangent)),
+            trial=lie.straightened(turn_and_shift(T, tangent)),
             damping=damping,
             num_steps=state.num_steps + 1,
             moving=jnp.max(jnp.abs(tangent)) > self.tolerance,

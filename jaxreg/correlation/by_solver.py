@@ -45,7 +45,7 @@ class Restarting(AbstractRestarts):
             jnp.zeros_like(at.b),
             self.max_steps,
         )
-        return lie.orthonormalise(turn_and_shift(T, found.x)), found
+        return lie.straightened(turn_and_shift(T, found.x)), found
 
 
 class _Links(AbstractSquares):

@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.loop import AbstractIteration
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
-from jaxreg.geometry.nearest_rotation import nearest_rotation
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.scale import fit_scale
 from jaxreg.local.steps import decoupled_error
@@ -125,7 +124,7 @@ class Descending(AbstractIteration[tuple[Motion, Scalar], Descent]):
         if limits.with_scale:
             growth, scaled = fit_scale(optimiser.residual, found, weight)
         T = optimiser.step(state.T, scaled, weight, optimiser.residual)
-        T = lie.compose(nearest_rotation(lie.rotation(T)), lie.translation(T))
+        T = lie.straightened(T)
         change = jnp.max(jnp.abs(decoupled_error(T, state.T)))
         change = jnp.maximum(change, jnp.abs(growth - 1))
         first = state.num_steps == 0

@@ -47,14 +47,14 @@ def descended(
         problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
         spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
         widths = jnp.geomspace(widest, 0.5 * spacing, _STEPS).astype(dtype)
-        T = lie.orthonormalise(coarse.repeat(problem, T, widths))
+        T = lie.straightened(coarse.repeat(problem, T, widths))
         evidence = scans.witness(i, j).of_pose(T)
         told = evidence.log_evidence + log_prior(scans.method_of(method, i, j), T)
         T = fine.repeat(problem, T, jnp.full(_POLISH, 0.5 * spacing, dtype))
         sound = scans.usable[i] & scans.usable[j] & jnp.all(jnp.isfinite(T))
         return RelativeMotions(
             row[0],
-            jnp.where(sound, lie.orthonormalise(T), jnp.eye(len(T), dtype=dtype))[None],
+            jnp.where(sound, lie.straightened(T), jnp.eye(len(T), dtype=dtype))[None],
             jnp.where(sound, evidence.overlap, 0)[None],
             jnp.where(sound, told, NO_EVIDENCE)[None],
             evidence.inlier_rmse[None],

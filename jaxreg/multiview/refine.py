@@ -119,7 +119,7 @@ def measured(
         i, j = pair
         problem = problem_of(scans, i, j, exact)
         T_i_j = lie.between(T_world_i[i], T_world_i[j])
-        return lie.orthonormalise(optimiser.repeat(problem, T_i_j, widths))
+        return lie.straightened(optimiser.repeat(problem, T_i_j, widths))
 
     def one(pair: Array) -> RelativeMotions:
         i, j = pair

@@ -66,7 +66,7 @@ def last_digits(
         most=_STEPS,
         tolerance=_ROUNDINGS * float(jnp.finfo(T.dtype).eps),
     )
-    T = lie.orthonormalise(T)
+    T = lie.straightened(T)
     found = match(problem, T)
     return T, Curvature.of(optimiser, problem, T, found, end)
 

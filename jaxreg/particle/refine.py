@@ -35,7 +35,7 @@ def refined(
     optimiser = cast_floats(optimiser, T.dtype)
     if len(widths):
         T = _of_used(lambda T: optimiser.repeat(problem, T, widths), T, used)
-    T = lie.orthonormalise(T)
+    T = lie.straightened(T)
     sound = used & jnp.all(jnp.isfinite(T), axis=(1, 2))
     eye = lie.identity(T.shape[-1] - 1, T.dtype, (1,))
     return jnp.where(sound[:, None, None], T, eye), sound
@@ -59,7 +59,7 @@ def polished(
     optimiser = polishing(kernel, T.dtype)
 
     def polish(T: Motion) -> Motion:
-        return lie.orthonormalise(
+        return lie.straightened(
             optimiser.repeat(problem, T, jnp.full(num_steps, width))
         )
 

@@ -94,6 +94,21 @@ def test_orthonormalise_gives_the_nearest_rotation():
 
 
 @pytest.mark.parametrize("d", [2, 3])
+def test_straightened_is_the_nearest_rotation_to_second_order(d):
+    rng = np.random.default_rng(d)
+    T = np.tile(np.eye(d + 1), (20, 1, 1))
+    T[:, :d, :d] = np.linalg.qr(rng.standard_normal((20, d, d)))[0]
+    T[:, :d, 0] *= np.linalg.det(T)[:, None]
+    T[:, :d] += 1e-4 * rng.standard_normal((20, d, d + 1))
+    with jax.enable_x64(True):
+        found = np.asarray(lie.straightened(jnp.asarray(T)))
+    U, _, Vt = np.linalg.svd(T[:, :d, :d])
+    np.testing.assert_allclose(found[:, :d, :d], U @ Vt, atol=1e-7)
+    assert np.max(np.abs(U @ Vt - T[:, :d, :d])) > 3e-5
+    np.testing.assert_array_equal(found[:, :, d], T[:, :, d])
+
+
+@pytest.mark.parametrize("d", [2, 3])
 def test_orthonormalise_never_reflects(d):
     T = np.tile(np.eye(d + 1), (20, 1, 1))
     T[:, :d, :d] = np.random.default_rng(d).standard_normal((20, d, d))

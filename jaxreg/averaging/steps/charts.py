@@ -14,7 +14,6 @@ from jaxreg._core.loop import iterate
 from jaxreg._core.restarts import MAX_STARTS, AbstractRestarts
 from jaxreg._core.solver import Lowered, Solver
 from jaxreg._core.typing import Scalar
-from jaxreg.averaging.steps.iterate import nearby_rotation
 from jaxreg.averaging.steps.levenberg_marquardt import Problem
 from jaxreg.geometry import lie
 from jaxreg.linear.small import product, root_semidefinite
@@ -71,7 +70,7 @@ class _Charts(AbstractRestarts):
         zero = jnp.zeros(((len(T) - 1) * k,), T.dtype)
         energy, rows = (eqx.Partial(f, T) for f in (self._energy, self._rows))
         found = self.solver.lower(energy, rows, zero, self.max_steps)
-        return nearby_rotation(self._moved(T, found.x)), found
+        return lie.straightened(self._moved(T, found.x)), found
 
     def _moved(self, T: Array, x: Array) -> Array:
         """The poses at tangents of all but pose 0; those that no edge holds stay."""

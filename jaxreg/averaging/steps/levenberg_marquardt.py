@@ -29,7 +29,7 @@ from jaxreg._core.solver import LinearSolver
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.measures import weighted_mean
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError
-from jaxreg.averaging.steps.iterate import STEP_TOLERANCE, nearby_rotation, pose_change
+from jaxreg.averaging.steps.iterate import STEP_TOLERANCE, pose_change
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
@@ -224,7 +224,7 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         if self.linear_solver is None:
             inverse = control.cond(kept, lambda: inverse, lambda: multigrid(matrix))
         x, rounds = _tangents(matrix, force, self.linear_solver or inverse)
-        T = nearby_rotation(product(lie.exp(x), s.T))
+        T = lie.straightened(product(lie.exp(x), s.T))
         cost = problem.cost(T)
         # Poses are known better than their cost: a step that is lost in its rounding
         # may still be right.

@@ -59,6 +59,11 @@ def along(direction: Float[Array, "d n"], match: Match) -> Float[Array, "k1 n"]:
     return jnp.stack([*direction, *turn, sum_rows(direction * match.residual)])
 
 
+def wrench(force: Float[Array, "d n"], match: Match) -> Float[Array, "k n"]:
+    """Rows (f, x cross f): what the forces on the points do to the pose."""
+    return jnp.stack([*force, *cross(match.rotated, force)])
+
+
 def half_sum(
     sq_residual: Float[Array, " n"], weight: Float[Array, " n"]
 ) -> Float[Array, ""]:

@@ -9,7 +9,7 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_positive
 from jaxreg.matching.problem import Match, sum_rows
 from jaxreg.matching.residuals.base import AbstractResidual
-from jaxreg.matching.residuals.gram import along, half_sum, weighted_gram
+from jaxreg.matching.residuals.gram import along, half_sum, weighted_gram, wrench
 from jaxreg.matching.residuals.point_to_point import PointToPoint
 
 
@@ -53,12 +53,12 @@ class PlaneToPlane(AbstractResidual):
         return H, b
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
-        """Half of point-to-point plus what pulls along s and a."""
-        out = PointToPoint().descents(match) / 2
+        """The wrench of M r."""
+        force = match.residual / 2
         for direction, stiffness in self._axes(match):
-            rows = along(direction, match)
-            out = out + stiffness[None] * rows[:-1] * rows[-1:]
-        return out
+            along_it = stiffness * sum_rows(direction * match.residual)
+            force = force + along_it[None] * direction
+        return wrench(force, match)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w r^T M r / 2."""

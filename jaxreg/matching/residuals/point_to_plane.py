@@ -9,7 +9,7 @@ from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_not_negative
 from jaxreg.matching.problem import Match
 from jaxreg.matching.residuals.base import AbstractResidual
-from jaxreg.matching.residuals.gram import along, half_sum, weighted_gram
+from jaxreg.matching.residuals.gram import along, half_sum, weighted_gram, wrench
 from jaxreg.matching.residuals.point_to_point import PointToPoint
 
 
@@ -41,10 +41,10 @@ class PointToPlane(AbstractResidual):
         return gram[:-1, :-1] + share * H, gram[:-1, -1] + share * b
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
-        """Rows (n, x cross n) times n . r, plus the share of points."""
-        rows = along(match.normal, match)
-        share = jnp.asarray(self.point_share, rows.dtype)
-        return rows[:-1] * rows[-1:] + share * PointToPoint().descents(match)
+        """The wrench of (n . r) n plus the share of r."""
+        r = match.residual
+        share = jnp.asarray(self.point_share, r.dtype)
+        return wrench(match.plane_residual[None] * match.normal + share * r, match)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w ((n . r)^2 + point_share |r|^2) / 2."""

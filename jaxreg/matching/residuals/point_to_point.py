@@ -5,9 +5,10 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg.geometry import lie
 from jaxreg.matching.problem import Match
 from jaxreg.matching.residuals.base import AbstractResidual
-from jaxreg.matching.residuals.gram import Moments, cross, half_sum
+from jaxreg.matching.residuals.gram import Moments, half_sum, wrench
 
 
 class PointToPoint(AbstractResidual):
@@ -33,9 +34,7 @@ class PointToPoint(AbstractResidual):
             GG = jnp.trace(xx)[None, None]
             Gr = (xr[0, 1] - xr[1, 0])[None]
         else:
-            zero = jnp.zeros_like(x[0])
-            G = jnp.stack([zero, x[2], -x[1], -x[2], zero, x[0], x[1], -x[0], zero])
-            G = G.reshape(3, 3)
+            G = -lie.hat(x)
             GG = jnp.trace(xx) * eye - xx
             Gr = jnp.stack(
                 [xr[1, 2] - xr[2, 1], xr[2, 0] - xr[0, 2], xr[0, 1] - xr[1, 0]]
@@ -44,8 +43,8 @@ class PointToPoint(AbstractResidual):
         return H, jnp.concatenate([moments.r, Gr])
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
-        """Rows (r, x cross r)."""
-        return jnp.stack([*match.residual, *cross(match.rotated, match.residual)])
+        """The wrench of r."""
+        return wrench(match.residual, match)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w |r|^2 / 2."""
