@@ -72,7 +72,7 @@ def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, ...]:
     """`(q,)` the numbers of poses `(q, 4, 4)`, as the evidence has them."""
     ready = prepare_pair(ParticleFilter(), tuple(map(jnp.asarray, clouds)))
     index = BruteForce.build(ready.target.points, ready.target.mask)
-    witness = Prepared(ready.source, ready.target, index).judged.exact.witness
+    witness = Prepared.of(ready.source, ready.target, index).judged.exact.witness
     (there, back), (own, other) = witness.problems, witness.spacings
 
     def of_pose(T: jax.Array) -> tuple[jax.Array, ...]:

@@ -68,7 +68,7 @@ def proposed(clouds: tuple[jax.Array, ...]) -> tuple[Agreed, Frames, jax.Array]:
     method = METHODS[1]
     ready = prepare_pair(method, clouds)
     index = method.index_of(ready.target)
-    spacing = Pair(ready.source, ready.target, index).spacing
+    spacing = Pair.of(ready.source, ready.target, index).spacing
     agreed = propose(ready.source, ready.target, spacing)
     T = agreed.T_target_source
     particles = Particles.at(T, len(T)).valued(-agreed.num_agreeing.astype(T.dtype))

@@ -9,8 +9,7 @@ from jaxreg._core.checks import check_callable, check_count, check_key, check_me
 from jaxreg._core.log import log_solution
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
-from jaxreg.averaging.gauge import average_graph
-from jaxreg.averaging.many import average_batch, average_list, check_init
+from jaxreg.averaging.many import average_batch, average_list, average_one, check_init
 from jaxreg.averaging.methods.correntropy import Correntropy
 from jaxreg.averaging.world.arguments import check_known
 from jaxreg.averaging.world.solve import average_known
@@ -151,8 +150,8 @@ def average(
 
     Compilation: graphs of a list are padded to one of few numbers of poses, four an
     octave from 8 on, and to the edges of the largest that shares it; each such size
-    compiles once. Padding changes an answer by rounding, unless `CycleConsensus` has to
-    search, whose draws depend on the number of edges.
+    compiles once. So is a graph of up to 128 poses outside of `jit`: two numbers of
+    poses and of edges an octave. Padding changes an answer by rounding.
     """
     method = Correntropy() if method is None else method
     check_method(method, AbstractAverager)
@@ -178,7 +177,7 @@ def average(
     start = check_init(init, one, "init")
     known = check_known(priors, fixed, control, levels, one) if told else None
     if known is None:
-        solution = average_graph(one, method, start, key)
+        solution = average_one(one, method, start, key)
     else:
         solution = average_known(one, method, known, start, key)
     log_solution("average", solution)

@@ -113,6 +113,14 @@ class AbstractAverager(BriefModule):
         """Averages a prepared graph; `init` has frame 0 at the identity, or is None."""
 
 
+class AbstractStart(AbstractAverager):
+    """A method that others start from: they want its poses and no solution."""
+
+    @abc.abstractmethod
+    def poses(self, graph: PoseGraph, key: Key | None) -> Float[Array, "v D D"]:
+        """Those of `solve` for a prepared graph."""
+
+
 def solution(
     graph: PoseGraph,
     T_world_i: Float[Array, "v D D"],
@@ -122,6 +130,7 @@ def solution(
     kernel_width: Array | None = None,
     num_steps: Array | int = 0,
     trace: AveragingTrace | None = None,
+    evidence: Float[Array, ""] | None = None,
 ) -> AveragingSolution:
     """Fills in what is the same for every method."""
     dtype = T_world_i.dtype
@@ -130,7 +139,7 @@ def solution(
     done = jnp.asarray(True) if converged is None else converged
     width = jnp.full((2,), jnp.inf, dtype) if kernel_width is None else kernel_width
     trust = jnp.where(graph.mask & (graph.weight > 0), trust, 0)
-    evidence = log_evidence(graph, T_world_i)
+    evidence = log_evidence(graph, T_world_i) if evidence is None else evidence
     none = nothing_agrees(jax.lax.stop_gradient(graph), evidence)
     status = jnp.where(none, Status.NO_AGREEMENT, status_of(done))
     return AveragingSolution(
@@ -173,4 +182,6 @@ def starting_poses(
     if init is not None:
         return init
     held = jax.lax.stop_gradient(graph)
+    if isinstance(initialiser, AbstractStart):
+        return initialiser.poses(held, key)
     return initialiser.solve(held, None, key).T_world_i

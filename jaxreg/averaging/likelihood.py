@@ -38,7 +38,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
 from jaxreg._core.quantile import nearest_rank
@@ -132,9 +132,7 @@ def explained(
     log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
     prior = log_odds[:, None] + weigh[None]
     none = jax.nn.softplus(prior)
-    rank = _neighbour_rank(graph, T_world_i)[None]
-    bound = jnp.asarray((*_NEAREST, jnp.iinfo(rank.dtype).max))[:, None]
-    is_near = (rank < bound).astype(sq.dtype)  # (t + 1, e)
+    is_near = _among_nearest(graph, T_world_i).astype(sq.dtype)  # (t + 1, e)
     band = jnp.diff(is_near, axis=0, prepend=0)
     allowed = log_odds[:, None] >= jnp.maximum(log_odds, 0)[None]  # near, far
     free, reach = graph.num_held - 1, _reach(graph.dim)
@@ -219,25 +217,29 @@ def _reach(dim: int) -> float:
     return (turns * ball) ** (1 / k) / math.sqrt(2 * math.pi)
 
 
-def _neighbour_rank(
+def _among_nearest(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"]
-) -> Int[Array, " e"]:
-    """How many measured neighbours of an end are nearer than the other end.
+) -> Bool[Array, "t e"]:
+    """Whether one end of an edge is among the t nearest measured neighbours of another.
 
-    Of the end that has fewer. Nearness is that of the poses: squared angle (chordal)
-    and squared length over `length_scale`. Edges as near as each other share a rank.
+    For each t of `_NEAREST`; the last row has all edges. Nearness is that of the poses:
+    squared angle (chordal) and squared length over `length_scale`. Edges as near as
+    each other are so alike.
     """
-    i, j = graph.edges[:, 0], graph.edges[:, 1]
     gap = graph.predicted(T_world_i)
     far = graph.dim - jnp.trace(lie.rotation(gap), axis1=-2, axis2=-1)
     shift = jnp.sum(lie.translation(gap) ** 2, axis=-1) / graph.length_scale**2
     far = jnp.where(graph.weight > 0, far + shift, jnp.inf)
-    frame, far = jnp.concatenate([i, j]), jnp.concatenate([far, far])
+    ends = graph.edges.T
+    frame, ascending = jax.lax.sort(
+        (ends.reshape(-1), jnp.concatenate([far, far])), num_keys=2
+    )
     place = jnp.arange(len(frame), dtype=jnp.int32)
-    frame, far, order = jax.lax.sort((frame, far, place), num_keys=2)
-    new_frame = jnp.append(True, frame[1:] != frame[:-1])
-    new = new_frame | jnp.append(True, far[1:] > far[:-1])
-    first = jax.lax.cummax(jnp.where(new_frame, place, 0))
-    rank = jax.lax.cummax(jnp.where(new, place, 0)) - first
-    rank = jnp.zeros_like(rank).at[order].set(rank, unique_indices=True)
-    return jnp.minimum(rank[: len(i)], rank[len(i) :])
+    first = jnp.full(graph.num_poses, len(frame), jnp.int32).at[frame].min(place)
+    # The t-th nearest of each frame; all are near where there are fewer.
+    last = first + jnp.asarray(_NEAREST, jnp.int32)[:, None] - 1
+    there = jnp.minimum(last, len(frame) - 1)
+    own = (frame[there] == jnp.arange(graph.num_poses)) & (last < len(frame))
+    bound = jnp.where(own, ascending[there], jnp.inf)
+    near = jnp.any(far <= bound[:, ends], axis=1)
+    return jnp.concatenate([near, jnp.ones_like(near[:1])])

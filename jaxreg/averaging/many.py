@@ -15,10 +15,11 @@ from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
 from jaxreg.batching.devices import Devices, map_rows, spread_rows
-from jaxreg.batching.padding import rounded_up, stacked
+from jaxreg.batching.padding import lengthened, rounded_up, stacked
 from jaxreg.batching.progress import tell
 from jaxreg.batching.side_by_side import side_by_side
 from jaxreg.graph.pose_graph import PoseGraph, check_graph, check_poses
+from jaxreg.linear.laplacian import DENSE_LIMIT
 
 
 # Graphs, which frames they have, their starts and keys; a leading axis on all arrays.
@@ -41,6 +42,37 @@ def check_init(
     found = check_poses(init, name, graph)
     check_rigid(found, name)
     return found
+
+
+def average_one(
+    graph: PoseGraph,
+    method: AbstractAverager,
+    init: Float[Array, "v D D"] | None,
+    key: Key | None,
+) -> AveragingSolution:
+    """`average_graph`; small graphs of similar sizes share its programs."""
+    arrays = jax.tree.leaves((graph, init, key))
+    own = (graph.num_poses, graph.num_edges)
+    num_poses, num_edges = (
+        rounded_up(n, k * _LEAST, 2) for n, k in zip(own, (1, 2), strict=True)
+    )
+    apart = graph.num_poses > DENSE_LIMIT or (num_poses, num_edges) == own
+    if apart or not all(map(_is_held, arrays)):
+        return average_graph(graph, method, init, key)
+    padded = dataclasses.replace(graph, num_poses=num_poses)
+    padded = jax.tree.map(lambda x: lengthened(x, num_edges), padded)
+    present = jax.device_put(np.arange(num_poses) < graph.num_poses)
+    if init is not None:
+        eye = np.eye(init.shape[-1], dtype=init.dtype)
+        more = np.broadcast_to(eye, (num_poses - len(init), *eye.shape))
+        init = jax.device_put(np.concatenate([init, more]))
+    found = average_graph(padded, method, init, key, present)
+    return _cut(jax.tree.map(lambda x: np.asarray(x)[None], found), 0, graph)
+
+
+def _is_held(x: Array) -> bool:
+    """Whether an array is here, and no device was chosen for it."""
+    return is_concrete(x) and not x.committed
 
 
 def average_list(

@@ -137,20 +137,19 @@ class Witness(eqx.Module):
         source, target = levelled(source.with_spacing(), target.with_spacing())
         if source.spacing is None or target.spacing is None:
             raise ValueError("Witness: clouds without spacings.")
+        (own, here), (other, there) = on_both(
+            lambda side: (balanced(side[0]), near_by_chance(*side)),
+            (source, source_index),
+            (target, target_index),
+        )
         return cls(
             (
                 Problem.of(source, target, target_index),
                 Problem.of(target, source, source_index),
             ),
             (source.spacing, target.spacing),
-            on_both(balanced, source, target),
-            jnp.minimum(
-                *on_both(
-                    lambda side: near_by_chance(*side),
-                    (source, source_index),
-                    (target, target_index),
-                )
-            ),
+            (own, other),
+            jnp.minimum(here, there),
         )
 
     @classmethod

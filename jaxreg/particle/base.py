@@ -182,7 +182,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
         # The search is not differentiated, its loops know no reverse mode; the answer
         # is, by what its last steps depend on.
         moving = cast_floats(self, source.points.dtype)
-        moving_pair = Pair(source, target, target_index)
+        moving_pair = Pair.of(source, target, target_index)
         self, pair, init = lax.stop_gradient((moving, moving_pair, init))
         key_points, key_search = jax.random.split(check_key(key))
         few = _some_points(key_points, pair.problem, self.num_points)

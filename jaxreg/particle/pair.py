@@ -11,11 +11,23 @@ from jaxreg.neighbours import AbstractIndex, index_within
 
 
 class Pair(eqx.Module):
-    """Two prepared clouds and the index of the target."""
+    """Two prepared clouds, the index of the target, and how far samples are apart."""
 
     source: PointCloud
     target: PointCloud
     target_index: AbstractIndex
+    spacings: tuple[Scalar, Scalar]
+
+    @classmethod
+    def of(
+        cls, source: PointCloud, target: PointCloud, target_index: AbstractIndex
+    ) -> "Pair":
+        """With the spacings of the clouds."""
+        spacings = on_both(
+            lambda cloud: median_spacing(cloud.points, cloud.mask),
+            *levelled(source, target),
+        )
+        return cls(source, target, target_index, spacings)
 
     @property
     def problem(self) -> Problem:
@@ -25,11 +37,11 @@ class Pair(eqx.Module):
     @property
     def exact(self) -> "ExactPair":
         """With indexes that miss no near point; tables miss every other."""
+        source, target = levelled(self.source, self.target)
         indexes = on_both(
-            lambda cloud: index_within(
-                cloud.points, cloud.mask, median_spacing(cloud.points, cloud.mask)
-            ),
-            *levelled(self.source, self.target),
+            lambda side: index_within(side[0].points, side[0].mask, side[1]),
+            (source, self.spacings[0]),
+            (target, self.spacings[1]),
         )
         return ExactPair(self.source, self.target, *indexes)
 
@@ -39,17 +51,12 @@ class Pair(eqx.Module):
         if self.source.judged is None and self.target.judged is None:
             return self
         clouds = levelled(self.source.as_judged, self.target.as_judged)
-        return Pair(*clouds, self.target_index)
+        return Pair.of(*clouds, self.target_index)
 
     @property
     def spacing(self) -> Scalar:
         """Between samples of the coarser cloud."""
-        return jnp.maximum(
-            *on_both(
-                lambda cloud: median_spacing(cloud.points, cloud.mask),
-                *levelled(self.source, self.target),
-            )
-        )
+        return jnp.maximum(*self.spacings)
 
 
 class ExactPair(eqx.Module):

@@ -23,7 +23,7 @@ from jaxreg.averaging.steps.gauss_newton import (
 )
 from jaxreg.averaging.steps.gradients import gauss_newton_gradients
 from jaxreg.averaging.steps.iterate import iterate
-from jaxreg.averaging.steps.kernel_width import annealed_width, gaussian_trust
+from jaxreg.averaging.steps.kernel_width import gaussian_trust, width_rule
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_error, translation_error
 from tests.averaging.graphs import random_graph
@@ -194,7 +194,8 @@ def test_the_next_width_is_solved_from_the_mean_square_inside_the_present_one():
     T[:, :3, 3] += width[0] * off * shift
     graph = PoseGraph.from_edges(edges, T.astype(np.float32), 15)
     poses = jnp.asarray(X, jnp.float32)
-    found = annealed_width(graph, poses, jnp.asarray(width), jnp.asarray(1.0))
+    begin, annealing = jnp.asarray(width), jnp.asarray(False)
+    found = width_rule(jnp.asarray(1.0), begin, annealing)(graph, poses, begin)
     # Gaussian weights: each kind of error at one width, so exp(-1/2) of either.
     trust = np.exp(-1.0)
     count = exact + (num - exact) * trust

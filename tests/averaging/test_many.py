@@ -1,17 +1,39 @@
 """Lists of graphs of unequal sizes."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxreg as jr
 from jaxreg import Status
 from jaxreg.averaging import many
+from jaxreg.averaging.gauge import average_graph
+from jaxreg.averaging.start.cycle_consensus import _noise
 from tests.averaging.graphs import random_graph
 
 
 SIZES = [(9, 20), (10, 30), (7, 15)]
 PLAIN = jr.MotionAveraging()
+
+
+@contextmanager
+def _compiled() -> Iterator[list[str]]:
+    """Names of what is compiled meanwhile."""
+    names = []
+
+    def hear(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event.endswith("backend_compile_duration"):
+            names.append(str(kwargs["fun_name"]))
+
+    jax.monitoring.register_event_duration_secs_listener(hear)
+    try:
+        yield names
+    finally:
+        jax.monitoring.unregister_event_duration_listener(hear)
 
 
 def _graphs(sizes, outliers: float = 0.1):
@@ -28,7 +50,7 @@ def _graphs(sizes, outliers: float = 0.1):
 def test_padding_changes_an_answer_by_rounding_only(method):
     graphs = _graphs(SIZES[:2])
     padded = jr.average(graphs, method)[0]  # to the poses and edges of the other
-    alone = jr.average(graphs[0], method)
+    alone = average_graph(graphs[0], method, None, None)
     assert int(padded.status) == int(alone.status) == Status.CONVERGED
     assert padded.T_world_i.shape == alone.T_world_i.shape
     np.testing.assert_allclose(padded.T_world_i, alone.T_world_i, atol=1e-4)
@@ -41,24 +63,43 @@ def test_a_hundred_sizes_compile_once_a_bucket_and_settings_never():
     sizes = [(8 + k % 9, 14 + k // 8) for k in range(100)]
     graphs = _graphs(sizes, outliers=0.0)
     programs, other = many._average_lanes, jr.MotionAveraging(tolerance=1e-5)
-    names = []
-
-    def hear(event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event.endswith("backend_compile_duration"):
-            names.append(str(kwargs["fun_name"]))
-
-    jax.monitoring.register_event_duration_secs_listener(hear)
-    try:
+    with _compiled() as names:
         found = jr.average(graphs, PLAIN)
         first = len(names)
         jr.average(graphs, other)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(hear)
     # 8, 10, 12, 14 and 16 poses.
     assert len([name for name in names if programs.__name__ in name]) == 5
     assert not names[first:]
     assert first < 20
     assert {int(sol.status) for sol in found} == {Status.CONVERGED}
+
+
+def test_single_graphs_of_similar_sizes_share_programs_and_keep_their_answers():
+    # 12 poses and 24 edges.
+    graphs = _graphs([(12, 24), (9, 17), (10, 22), (11, 20)], outliers=0.0)
+    starts = [average_graph(g, jr.SpanningTree(), None, None).T_world_i for g in graphs]
+    jr.average(graphs[0], PLAIN, starts[0])
+    jr.average(graphs[1], PLAIN, starts[1])
+    with _compiled() as names:
+        found = [
+            jr.average(*gx) for gx in zip(graphs, [PLAIN] * 4, starts, strict=True)
+        ]
+    assert not names
+    for graph, start, sol in zip(graphs, starts, found, strict=True):
+        alone = average_graph(graph, PLAIN, start, None)
+        assert sol.T_world_i.shape == alone.T_world_i.shape
+        assert sol.edge_weight.shape == alone.edge_weight.shape
+        assert int(sol.status) == Status.CONVERGED
+        np.testing.assert_allclose(sol.T_world_i, alone.T_world_i, atol=1e-5)
+        np.testing.assert_allclose(sol.log_evidence, alone.log_evidence, rtol=1e-4)
+
+
+def test_what_a_search_draws_for_an_edge_does_not_depend_on_others():
+    few, more = (
+        _noise(jax.random.key(3), n, 5, jnp.dtype(jnp.float32)) for n in (7, 16)
+    )
+    np.testing.assert_array_equal(few, more[:, :, :7])
+    assert np.unique(more).size == more.size
 
 
 def test_a_graph_without_valid_edges_has_its_status_and_the_others_their_poses():

@@ -123,4 +123,4 @@ def test_in_the_plane_there_are_none():
 
 
 def _pair(source: PointCloud, target: PointCloud) -> Pair:
-    return Pair(source, target, BruteForce.build(target.points, target.mask))
+    return Pair.of(source, target, BruteForce.build(target.points, target.mask))

@@ -65,7 +65,7 @@ def _pair(d: int, T: np.ndarray | None = None) -> Pair:
     T = np.eye(d + 1) if T is None else T
     points = blob(2 * N, d) - blob(2 * N, d).mean(0)
     source, target = _cloud(move(np.linalg.inv(T), points[:N])), _cloud(points)
-    return Pair(source, target, BruteForce.build(target.points))
+    return Pair.of(source, target, BruteForce.build(target.points))
 
 
 @eqx.filter_jit

@@ -12,7 +12,7 @@ from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import (
-    AbstractAverager,
+    AbstractStart,
     AveragingSolution,
     of_start,
     solution,
@@ -31,7 +31,11 @@ from jaxreg.linear.laplacian import DENSE_LIMIT
 _HEAT = (0.25, 2.0)
 
 
-class CycleConsensus(AbstractAverager):
+# Poses that are compared side by side, at most: about what fits a CPU's caches.
+_GROUP = 12
+
+
+class CycleConsensus(AbstractStart):
     """Chains motions along edges that close cycles, and keeps the likeliest poses.
 
     Each edge gets log odds from its 3-cycles at several scales (`edge_log_odds`), and
@@ -57,7 +61,7 @@ class CycleConsensus(AbstractAverager):
 
     hypotheses: int = eqx.field(static=True, default=32)
     rounds: int = eqx.field(static=True, default=16)
-    max_cycles: int = eqx.field(static=True, default=1_000_000)
+    max_cycles: int = eqx.field(static=True, default=1 << 20)
 
     def __check_init__(self) -> None:
         check_counts(self, hypotheses=1, rounds=1, max_cycles=0)
@@ -71,13 +75,22 @@ class CycleConsensus(AbstractAverager):
         """Finds a start for a prepared graph; `edge_weight` is trust by cycles."""
         held = jax.lax.stop_gradient(graph)
         if not judged(held, self.max_cycles):
-            return of_start(self, graph, _by_trees(held))
-        search = _Search(held, self.hypotheses, self.rounds)
+            return of_start(self, graph, _of_tree(held, _by_trees(held)))
+        return of_start(self, graph, _with_trust(held, self._best(held, key)))
+
+    def poses(self, graph: PoseGraph, key: Key | None) -> Float[Array, "v D D"]:
+        """The likeliest poses; asking for derivatives gets zeros."""
+        if not judged(graph, self.max_cycles):
+            return _by_trees(graph)
+        return self._best(graph, key).T
+
+    def _best(self, graph: PoseGraph, key: Key | None) -> "_Best":
+        search = _Search(graph, self.hypotheses, self.rounds)
         best = search.init(key)
         # Most graphs are done: the search is compiled for one that is not.
         if not is_concrete(best.settled) or not best.settled:
             best = _searched(search, best)
-        return of_start(self, graph, _with_trust(held, best))
+        return best
 
 
 class _Best(NamedTuple):
@@ -138,9 +151,7 @@ class _Search(AbstractIteration[Key | None, _Best]):
         graph, best, odds = self.graph, state, state.odds
         key, now = jax.random.split(best.key)
         heat = jnp.geomspace(*_HEAT, self.hypotheses, dtype=odds.dtype)[:, None]
-        noise = jax.random.logistic(
-            now, (2, self.hypotheses, graph.num_edges), odds.dtype
-        )
+        noise = _noise(now, graph.num_edges, self.hypotheses, odds.dtype)
         each = odds[jnp.arange(self.hypotheses) % odds.shape[0]]
         each = jnp.exp(heat * noise[0]) * each + 2 * heat * noise[1]
         # What contradicts the best poses loses nothing: chains of them drift.
@@ -160,9 +171,20 @@ class _Search(AbstractIteration[Key | None, _Best]):
         )
 
 
+def _noise(
+    key: Key, num_edges: int, hypotheses: int, dtype: jnp.dtype
+) -> Float[Array, "2 h e"]:
+    """Logistic; that of an edge is the same whatever edges there are behind it."""
+
+    def of_edge(edge: Array) -> Array:
+        own = jax.random.fold_in(key, edge)
+        return jax.random.logistic(own, (2, hypotheses), dtype)
+
+    return jax.vmap(of_edge, out_axes=2)(jnp.arange(num_edges, dtype=jnp.uint32))
+
+
 @kept_program
-def _by_trees(graph: PoseGraph) -> AveragingSolution:
-    graph = jax.lax.stop_gradient(graph)
+def _by_trees(graph: PoseGraph) -> Float[Array, "v D D"]:
     args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
     T = jnp.stack(
         [
@@ -170,7 +192,12 @@ def _by_trees(graph: PoseGraph) -> AveragingSolution:
             trees.maximum_spanning_tree(*args).T_world_i,
         ]
     )
-    return solution(graph, T[_likeliest(graph, T)[0]], num_steps=0)
+    return T[_likeliest(graph, T)[0]]
+
+
+@kept_program
+def _of_tree(graph: PoseGraph, T_world_i: Float[Array, "v D D"]) -> AveragingSolution:
+    return solution(graph, T_world_i, num_steps=0)
 
 
 @kept_program
@@ -186,7 +213,9 @@ def _with_trust(graph: PoseGraph, best: _Best) -> AveragingSolution:
 
 def _likeliest(graph: PoseGraph, T: Float[Array, "m v D D"]) -> tuple[Array, Array]:
     """Which of some poses, and their log likelihood ratio."""
-    ratio = jax.lax.map(lambda T: explained(graph, T).log_ratio, T, batch_size=8)
+    # Groups of one size: what is left over would be a program of its own.
+    group = max(k for k in range(1, _GROUP + 1) if len(T) % k == 0)
+    ratio = jax.lax.map(lambda T: explained(graph, T).log_ratio, T, batch_size=group)
     best = jnp.argmax(ratio)
     return best, ratio[best]
 

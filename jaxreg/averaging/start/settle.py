@@ -7,7 +7,6 @@ from jaxtyping import Array, Float
 from jaxreg._core import control
 from jaxreg.averaging.likelihood import explained
 from jaxreg.averaging.start.cycles import ROUNDS
-from jaxreg.averaging.steps.iterate import nearby_rotation
 from jaxreg.averaging.steps.kernel_width import KERNEL_DEVIATIONS, gaussian_trust
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
@@ -38,6 +37,6 @@ def settled(
         ridge = 1e-5 * jnp.max(jnp.diagonal(L)) * jnp.eye(num, dtype=L.dtype)
         factor = jnp.linalg.cholesky(L + ridge)
         tangent = jax.scipy.linalg.cho_solve((factor, True), rhs)
-        return nearby_rotation(product(lie.exp(tangent), T))
+        return lie.straightened(product(lie.exp(tangent), T))
 
     return control.fori_loop(0, ROUNDS, step, T_world_i)

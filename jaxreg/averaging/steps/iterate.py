@@ -68,25 +68,20 @@ def going_on(first: Iterated, then: Iterated) -> Iterated:
     return then._replace(num_steps=num_steps, trace=trace)
 
 
-def solution_of(graph: PoseGraph, end: Iterated) -> AveragingSolution:
-    """The solution where the loop stopped."""
+def solution_of(
+    graph: PoseGraph, end: Iterated, evidence: Scalar | None = None
+) -> AveragingSolution:
+    """The solution where the loop stopped; its `log_evidence` if that is known."""
     return solution(
         graph,
         end.T_world_i,
+        evidence=evidence,
         edge_weight=end.trust,
         converged=end.converged,
         kernel_width=end.width,
         num_steps=end.num_steps,
         trace=end.trace,
     )
-
-
-def nearby_rotation(T: Float[Array, "*b D D"]) -> Float[Array, "*b D D"]:
-    """One Newton step back onto SE(d), exact to second order in the departure."""
-    R = lie.rotation(T)
-    gram = product(jnp.swapaxes(R, -1, -2), R)
-    eye = jnp.broadcast_to(jnp.eye(R.shape[-1], dtype=R.dtype), R.shape)
-    return lie.compose(product(R, 1.5 * eye - 0.5 * gram), lie.translation(T))
 
 
 def averaging_step(rows: AbstractRows) -> Step:
@@ -112,7 +107,7 @@ def averaged(
 ) -> Float[Array, "v D D"]:
     """The poses after one step; `solve` finds tangents from logarithms (Eq. 20)."""
     tangent = solve(lie.log(graph.residual_motions(T)))
-    return nearby_rotation(product(lie.exp(tangent), T))
+    return lie.straightened(product(lie.exp(tangent), T))
 
 
 def iterate(

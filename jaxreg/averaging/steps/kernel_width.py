@@ -43,27 +43,21 @@ def first_width(
     return jnp.stack([width * graph.length_scale, width])
 
 
-def annealed_width(
-    graph: PoseGraph,
-    T_world_i: Float[Array, "v D D"],
-    width: Float[Array, "2"],
-    scale: Float[Array, ""],
-) -> Float[Array, "2"]:
+def width_rule(
+    scale: Float[Array, ""], begin: Float[Array, "2"], settling: Bool[Array, ""]
+) -> WidthOf:
     """The next width: three deviations of the edges inside the present one.
 
-    Never wider than before, nor narrower than half of it. `scale` is the `length_scale`
-    of the graph.
+    While annealing never wider than before, nor narrower than half of it; while
+    settling near `begin`, so that it ends as three deviations inside itself. `scale` is
+    the `length_scale` of the graph.
     """
-    target = _three_deviations(graph, T_world_i, width, scale)
-    return jnp.clip(target, width / 2, width)
-
-
-def settled_width(scale: Float[Array, ""], annealed: Float[Array, "2"]) -> WidthOf:
-    """Widths near the annealed ones, until each is three deviations inside itself."""
 
     def width_of(graph: PoseGraph, T: Array, width: Array) -> Array:
         target = _three_deviations(graph, T, width, scale)
-        return jnp.clip(target, annealed / _NEAR, annealed * _NEAR)
+        least = jnp.where(settling, begin / _NEAR, width / 2)
+        most = jnp.where(settling, begin * _NEAR, width)
+        return jnp.clip(target, least, most)
 
     return width_of
 
@@ -75,7 +69,7 @@ def followed_width(
     T_world_i: Float[Array, "v D D"],
     width: Float[Array, "2"],
 ) -> Float[Array, "2"]:
-    """The width of arguments of `annealed_width`, with derivatives if it has settled.
+    """The width that a `width_rule` is given, with derivatives if it has settled.
 
     Then it is three deviations of the edges inside itself, and follows motions, weights
     and poses by that equation; a width that would grow, but may not, is held.

@@ -23,7 +23,6 @@ from jaxreg.averaging.world.arguments import Known
 from jaxreg.averaging.world.parts import brought
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import (
-    KnownPoses,
     anchored,
     fixed_as_priors,
     without_priors,
@@ -75,8 +74,6 @@ def average_in_world(
     return _averaged(graph, method, known, init, None, unit)
 
 
-@kept_program
-@control.over_devices
 def _averaged(
     graph: PoseGraph,
     method: AbstractAverager,
@@ -85,18 +82,19 @@ def _averaged(
     key: Key | None,
     unit: Float[Array, ""],
 ) -> AveragingSolution:
-    if known.num_fixed:
-        found, part = _of_parts_beside(graph, method, known.poses, init, key)
-    else:
-        found, part = _of_parts(graph, method, init, key)
-    return _adjusted(graph, known, found, part, unit)
+    """The graph alone, by programs that serve whatever is known; then adjusted."""
+    whole, start, label = _whole(graph, known, init)
+    found = average_graph(whole, method, start, key)
+    return _adjusted(graph, known, found, label, unit)
 
 
+@kept_program
+@control.over_devices
 def _adjusted(
     graph: PoseGraph,
     known: Known,
     found: AveragingSolution,
-    part: Int[Array, " v"],
+    label: Int[Array, " u"],
     unit: Float[Array, ""],
 ) -> AveragingSolution:
     """The parts brought into the world, and adjusted to what is known.
@@ -104,10 +102,11 @@ def _adjusted(
     Args:
         graph: the relative motions.
         known: poses, points and levels.
-        found: of each part on its own, with the trust in its edges.
-        part: the lowest number of the frames of each frame's part.
+        found: of the graph as a `_whole`.
+        label: its parts.
         unit: the length that stands for a radian.
     """
+    found, part = _of_own_frames(graph, known, found, label)
     poses, points, levels = known.poses, known.points, known.levels
     held = jax.lax.stop_gradient((found.T_world_i, part, poses, points, levels, unit))
     start = brought(*held)
@@ -139,46 +138,45 @@ def _adjusted(
     )
 
 
-def _of_parts(
-    graph: PoseGraph,
-    method: AbstractAverager,
-    init: Float[Array, "v D D"] | None,
-    key: Key | None,
-) -> tuple[AveragingSolution, Int[Array, " v"]]:
-    """Each part of a graph on its own, and the lowest number of its frames."""
+@kept_program
+@control.over_devices
+def _whole(
+    graph: PoseGraph, known: Known, init: Float[Array, "v D D"] | None
+) -> tuple[PoseGraph, Float[Array, "u D D"] | None, Int[Array, " u"]]:
+    """A graph of one part, the start, and the lowest frame of each frame's own part.
+
+    Parts are hung to frame 0, each to be averaged on its own. Fixed frames are one
+    frame, the world, which comes first: the parts that they hold are one part.
+    """
+    if known.num_fixed:
+        poses = known.poses
+        if init is not None:
+            eye = jnp.eye(graph.dim + 1, dtype=init.dtype)[None]
+            fixed = poses.fixed[:, None, None]
+            init = jnp.concatenate([eye, jnp.where(fixed, poses.T_world_fixed, init)])
+        graph = anchored(graph, without_priors(poses))
     label = components(graph.edges, graph.weight, graph.num_poses)
     frame = jnp.arange(graph.num_poses, dtype=jnp.int32)
     hung = (label == frame) & (label != label[0])
     T_0_i = None if init is None else lie.between(init[0], init)
-    found = average_graph(with_hung(graph, hung, T_0_i), method, init, key)
-    trust = found.edge_weight[: graph.num_edges]
-    return eqx.tree_at(lambda s: s.edge_weight, found, trust), label
+    return with_hung(graph, hung, T_0_i), init, label
 
 
-def _of_parts_beside(
-    graph: PoseGraph,
-    method: AbstractAverager,
-    poses: KnownPoses,
-    init: Float[Array, "v D D"] | None,
-    key: Key | None,
+def _of_own_frames(
+    graph: PoseGraph, known: Known, found: AveragingSolution, label: Int[Array, " u"]
 ) -> tuple[AveragingSolution, Int[Array, " v"]]:
-    """The same of a graph with fixed frames, which are one frame, the world.
-
-    The parts that they hold are one part.
-    """
-    num, fixed = graph.num_poses, poses.fixed[:, None, None]
-    if init is not None:
-        eye = jnp.eye(graph.dim + 1, dtype=init.dtype)[None]
-        init = jnp.concatenate([eye, jnp.where(fixed, poses.T_world_fixed, init)])
-    whole = anchored(graph, without_priors(poses))
-    found, label = _of_parts(whole, method, init, key)
-    label = jnp.where(poses.fixed, 0, label[1:])
-    frame = jnp.arange(num, dtype=jnp.int32)
-    first = jax.ops.segment_min(frame, label, num + 1)
-    T_world_i = jnp.where(fixed, poses.T_world_fixed, found.T_world_i[1:])
-    trust = found.edge_weight[: graph.num_edges]
+    """The poses and the trust of the graph itself, and the parts of its frames."""
+    T_world_i, part, num = found.T_world_i, label, graph.num_poses
+    if known.num_fixed:
+        poses = known.poses
+        label = jnp.where(poses.fixed, 0, label[1:])
+        frame = jnp.arange(num, dtype=jnp.int32)
+        part = jax.ops.segment_min(frame, label, num + 1)[label]
+        fixed = poses.fixed[:, None, None]
+        T_world_i = jnp.where(fixed, poses.T_world_fixed, T_world_i[1:])
     at = lambda s: (s.T_world_i, s.edge_weight)  # noqa: E731
-    return eqx.tree_at(at, found, (T_world_i, trust)), first[label]
+    trust = found.edge_weight[: graph.num_edges]
+    return eqx.tree_at(at, found, (T_world_i, trust)), part
 
 
 def moved_back(
