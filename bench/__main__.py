@@ -2,8 +2,8 @@
 
 Writes OUT/rows.jsonl while it runs, and OUT/REPORT.md with plots in the end. Peers come
 with `pip install '.[bench]'` (probreg, which builds from source and needs six and
-scikit-learn, by hand); one that is missing has a row that says so. An interrupted call
-goes on with --resume.
+scikit-learn, and pypose and theseus-ai, which need PyTorch, by hand); one that is
+missing has a row that says so. An interrupted call goes on with --resume.
 """
 
 import argparse

@@ -7,6 +7,8 @@ all pairs; called with arrays, a thin loop chooses the pairs round by round, run
 batches of them at a time, and reports progress.
 """
 
+import contextlib
+from concurrent.futures import Executor
 from typing import Any
 
 import jax
@@ -37,6 +39,7 @@ from jaxreg.multiview.prepare import PreparedScans, prepare_scans
 from jaxreg.multiview.register_pairs import OnPairs, Rounds
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
 from jaxreg.multiview.solution import ReconstructionSolution
+from jaxreg.multiview.workers import Workers, check_executor
 from jaxreg.particle import ParticleFilter
 from jaxreg.registrar import AbstractRegistrar
 
@@ -59,6 +62,7 @@ def reconstruct(
     levels: Told = None,
     progress: Progress | None = None,
     on_pairs: OnPairs | None = None,
+    executor: Executor | None = None,
 ) -> ReconstructionSolution:
     """Brings scans into one frame, without an initial guess.
 
@@ -105,6 +109,12 @@ def reconstruct(
         on_pairs: called with the `RelativeMotions` of every few pairs as they are
             found, in the input's frames and unit, as NumPy arrays with motions in
             float64: from these `previous` gets the very bits; not under `jit`.
+        executor: registers pairs in other processes, on machines alike to the same
+            bits: a `concurrent.futures.ProcessPoolExecutor` that spawns its processes,
+            or any other `Executor`, such as `get_executor()` of a client of
+            `dask.distributed`. They read the scans in the folder for temporary files
+            (TMPDIR), and share the programs that `jaxreg.cache()` keeps. `on_pairs` is
+            told what they found before one of them failed. Not under `jit`.
 
     Returns:
         A `ReconstructionSolution`. Of NumPy arrays of float64 in map coordinates, see
@@ -136,6 +146,7 @@ def reconstruct(
     check_flag(hold_previous, "hold_previous")
     check_callable(progress, "progress")
     check_callable(on_pairs, "on_pairs")
+    check_executor(executor)
     far = FarScans(scans, mask)
     points, row_mask = padded_scans(far.scans, mask)
     eyes = checked_viewpoints(far.viewpoints(viewpoints), points, row_mask)
@@ -155,9 +166,10 @@ def reconstruct(
         known = KnownWorld.of(*moved, points)
     key, order = check_key(key), _checked(order)
     if not (is_concrete(points) and is_concrete(key)):
-        if order != "any" or not (previous is None and on_pairs is None):
+        if order != "any" or any(x is not None for x in (previous, on_pairs, executor)):
             raise ValueError(
-                "order, previous, on_pairs: pairs are chosen outside of jit only."
+                "order, previous, on_pairs, executor: pairs are chosen outside of jit "
+                "only."
             )
         if far.moved:
             raise ValueError(
@@ -165,7 +177,7 @@ def reconstruct(
             )
         solution = _of_all_pairs(method, averaging, inputs, key, known)
     else:
-        told = order, previous, hold_previous, progress, on_pairs
+        told = order, previous, hold_previous, progress, on_pairs, executor
         solution = _of_chosen_pairs(method, averaging, inputs, key, known, *told)
     origin = None if known is None else known.origin_of(solution)
     solution = far.back(solution, origin)
@@ -186,6 +198,7 @@ def _of_chosen_pairs(
     hold_previous: bool,
     progress: Progress | None,
     on_pairs: OnPairs | None,
+    executor: Executor | None,
 ) -> ReconstructionSolution:
     """Round by round, each of pairs that those before ask for."""
 
@@ -198,8 +211,13 @@ def _of_chosen_pairs(
     prepared = jax.block_until_ready(prepare_scans(method, *inputs))
     report("preparing scans", 1, 1)
     before, first = _known(previous, prepared, order)
-    rounds = Rounds(method, averaging, prepared, key, before, on_pairs, report)
-    motions = rounds.run(order, first)
+    with contextlib.ExitStack() as stack:
+        workers = None
+        if executor is not None:
+            workers = stack.enter_context(Workers(executor, method, prepared, key))
+        told = before, on_pairs, report, workers
+        rounds = Rounds(method, averaging, prepared, key, *told)
+        motions = rounds.run(order, first)
     report("averaging and refining", 0, 1)
     hold = None
     if hold_previous and isinstance(previous, ReconstructionSolution):

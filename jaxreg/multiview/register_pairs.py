@@ -1,6 +1,6 @@
 """Registers pairs of scans round by round, each chosen by what the last ones say."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from jaxreg.multiview.near_pairs import likely_overlap
 from jaxreg.multiview.place import Placement, joins, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
+from jaxreg.multiview.workers import Workers
 from jaxreg.registrar import AbstractRegistrar
 
 
@@ -48,6 +49,7 @@ class Rounds:
         known: motions that need not be found again, in the scans' centred frames.
         on_pairs: told of every batch, or None.
         report: told of progress.
+        workers: who registers pairs; None for threads of this process.
     """
 
     def __init__(
@@ -59,7 +61,9 @@ class Rounds:
         known: RelativeMotions | None,
         on_pairs: OnPairs | None,
         report: Progress,
+        workers: Workers | None = None,
     ) -> None:
+        self.workers = workers
         self.method, self.averaging, self.scans = method, averaging, scans
         self.key, self.on_pairs, self.report = key, on_pairs, report
         self.known, self.row = known, {}
@@ -117,25 +121,34 @@ class Rounds:
         total = self.num_tried
         done = total - len(pairs)
         self.report("registering pairs", done, total)
-        starts = range(0, len(pairs), _PAIRS_PER_BATCH)
-        if not starts:
-            return
-
-        def run(start: int) -> RelativeMotions:
-            rows = np.arange(start, start + _PAIRS_PER_BATCH)
-            batch = jax.device_put(pairs[np.minimum(rows, len(pairs) - 1)])
-            out = relative_motions(self.method, self.scans, batch, self.key)
-            out = jax.block_until_ready(out).rows(
-                jnp.arange(min(_PAIRS_PER_BATCH, len(pairs) - start))
-            )
+        found: dict[int, RelativeMotions] = {}
+        for number, batch in self._searched(pairs):
+            start = number * _PAIRS_PER_BATCH
+            rows = jnp.arange(min(_PAIRS_PER_BATCH, len(pairs) - start))
+            out = batch.rows(rows)
             rivals = [self.rivals.get(tuple(pair)) for pair in out.pairs.tolist()]
-            return out.or_better(rivals)
-
-        for batch in map_in_threads(run, starts, _THREADS):
-            self.found.append(batch)
-            self._tell(batch)
-            done += len(batch.overlap)
+            found[number] = out.or_better(rivals)
+            self._tell(found[number])
+            done += len(rows)
             self.report("registering pairs", done, total)
+        self.found += [found[number] for number in sorted(found)]
+
+    def _searched(self, pairs: np.ndarray) -> Iterator[tuple[int, RelativeMotions]]:
+        """Batches of pairs and their numbers as they come; the last is filled up."""
+        rows = np.arange(0, len(pairs), _PAIRS_PER_BATCH)[:, None]
+        rows = rows + np.arange(_PAIRS_PER_BATCH)
+        batches = list(pairs[np.minimum(rows, len(pairs) - 1)])
+        if self.workers is not None:
+            yield from self.workers.registered(batches)
+        elif batches:
+
+            def run(batch: np.ndarray) -> RelativeMotions:
+                found = relative_motions(
+                    self.method, self.scans, jax.device_put(batch), self.key
+                )
+                return jax.block_until_ready(found)
+
+            yield from enumerate(map_in_threads(run, batches, _THREADS))
 
     def _tell(self, found: RelativeMotions) -> None:
         if self.on_pairs is not None:

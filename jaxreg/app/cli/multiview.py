@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import jaxreg
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Progress
 from jaxreg.app.cli import outputs
+from jaxreg.app.cli.cluster import executor_of
 from jaxreg.app.cli.inputs import Scans, check_point, load_scans, read_positions
 from jaxreg.app.cli.known import (
     NOTHING,
@@ -52,7 +54,11 @@ def run(command: Multiview, session: Session) -> int:
     log = _log(command, session, scans)
     view = _view(session, scans, method, log) if command.view else None
     try:
-        with session.progress() as progress, session.timed("run", computes=True):
+        with (
+            executor_of(command.cluster) as executor,
+            session.progress() as progress,
+            session.timed("run", computes=True),
+        ):
             result = reconstruct_scans(
                 scans,
                 key,
@@ -64,15 +70,18 @@ def run(command: Multiview, session: Session) -> int:
                 located,
                 known,
                 None if view is None else view.pairs,
+                executor,
             )
         if view is not None:
             view.poses(result.T_world_i, result.component, result.edges, result.weight)
     except KeyboardInterrupt as err:
         if not len(log):
             raise
-        raise KeyboardInterrupt(
-            f"pairs kept in {log.path}: {len(log)}; "
-            "the same command with --resume goes on from there"
+        raise KeyboardInterrupt(_kept(log)) from err
+    except BrokenExecutor as err:
+        raise InputError(
+            f"--cluster {command.cluster}: a process ended before its pairs were "
+            f"registered, as for want of memory.\n{_kept(log)}"
         ) from err
     finally:
         if view is not None:
@@ -81,6 +90,13 @@ def run(command: Multiview, session: Session) -> int:
     code = report(session, result, scans, errors)
     log.remove()
     return code
+
+
+def _kept(log: PairLog) -> str:
+    return (
+        f"pairs kept in {log.path}: {len(log)}; "
+        "the same command with --resume goes on from there"
+    )
 
 
 def _view(
@@ -162,6 +178,7 @@ def reconstruct_scans(
     positions: jaxreg.ScanPositions | None = None,
     known: KnownOfGraph | None = None,
     heard: Callable[[Pairs], None] | None = None,
+    executor: Executor | None = None,
 ) -> Result:
     """Reconstructs centred scans and moves the answer to the frames of the files.
 
@@ -193,6 +210,7 @@ def reconstruct_scans(
         previous=None if kept is None else jaxreg.RelativeMotions.kept(*kept),
         progress=progress,
         on_pairs=keep,
+        executor=executor,
     )
     result = result_of(sol, scans.points, scans.names)
     result = dataclasses.replace(result, covariances=_covariances(centred, sol))

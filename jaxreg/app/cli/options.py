@@ -207,6 +207,13 @@ class Multiview(ModelOptions, KnownOptions):
     """Of all scans, told beside lengths: mm, cm, m, km, in, ft."""
     resume: bool = False
     """Go on with the pairs that an interrupted run left in the output folder."""
+    cluster: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="local:N|ADDRESS", help_behavior_hint="(default: this process)"
+        ),
+    ] = None
+    """Register pairs in N processes, or by a Dask scheduler (extra `cluster`)."""
     view: bool = False
     """Show scans, pairs and trust in the browser as they come; of the extra `view`."""
 

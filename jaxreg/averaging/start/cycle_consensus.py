@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.checks import check_counts, is_concrete
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.programs import kept_program
@@ -240,15 +241,21 @@ def _shortest(graph: PoseGraph, odds: Array) -> Array:
 def _is_settled(graph: PoseGraph, odds: Array, T: Array) -> Array:
     """True if trusted edges reach every frame and hardly any contradicts the poses.
 
-    The edges trusted at any one scale: noise may leave few at the finest.
+    The edges trusted at any one scale: noise may leave few at the finest. The first
+    scale answers as a rule, so one is asked after another.
     """
     placed = trees.components(graph.edges, graph.weight, graph.num_poses) == 0
 
-    def at_scale(odds: Array) -> Array:
-        trusted = jnp.where(odds > 0, graph.weight, 0)
+    def at_next_scale(asked: tuple[Array, Array]) -> tuple[Array, Array]:
+        scale, _ = asked
+        trusted = jnp.where(odds[scale] > 0, graph.weight, 0)
         component = trees.components(graph.edges, trusted, graph.num_poses)
         reached = jnp.all((component == 0) | ~placed)
         part = eqx.tree_at(lambda g: g.weight, graph, trusted)
-        return reached & (agreed_share(part, T) > SETTLED)
+        return scale + 1, reached & (agreed_share(part, T) > SETTLED)
 
-    return jnp.any(jax.vmap(at_scale)(odds))
+    return control.while_loop(
+        lambda asked: ~asked[1] & (asked[0] < len(odds)),
+        at_next_scale,
+        (jnp.asarray(0, jnp.int32), jnp.asarray(False)),
+    )[1]

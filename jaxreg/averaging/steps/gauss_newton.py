@@ -29,13 +29,15 @@ def normal_equations(
     J, error = _linearised(graph, T_world_i)
     WJ = product(precision, J)
     JWJ = product(jnp.swapaxes(J, -1, -2), WJ)
-    H = jnp.zeros((num, num, k, k), J.dtype)
-    H = H.at[i, i].add(JWJ).at[j, j].add(precision)
-    H = H.at[j, i].add(WJ).at[i, j].add(jnp.swapaxes(WJ, -1, -2))
+    # Scattered into their places, with the diagonal halved: a transpose adds the rest.
+    ends, frame = jnp.concatenate([i, j]), jnp.arange(num)
+    own = jax.ops.segment_sum(jnp.concatenate([JWJ, precision]), ends, num)
+    side = jnp.zeros((num, k, num, k), J.dtype).at[j, :, i, :].add(WJ)
     g = _pulled(graph, J, precision, error)
-    free = jnp.trace(H[jnp.arange(num), jnp.arange(num)], axis1=-2, axis2=-1) > 0
+    free = jnp.trace(own, axis1=-2, axis2=-1) > 0
     free = jnp.repeat(free.at[0].set(False), k)
-    H = H.transpose(0, 2, 1, 3).reshape(num * k, num * k)
+    half = side.at[frame, :, frame, :].add(own / 2).reshape(num * k, num * k)
+    H = half + half.T
     H = jnp.where(free[:, None] & free[None, :], H, 0)
     held = (~free).astype(H.dtype)
     return H + jnp.diag(held), jnp.where(free, g.reshape(-1), 0)

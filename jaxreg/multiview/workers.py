@@ -1,0 +1,162 @@
+"""Pairs of scans registered by the processes of an executor.
+
+`concurrent.futures` hands out the tasks, as do engines that follow it (Dask's
+`Client.get_executor()`). Prepared scans lie in a file that every process reads once.
+"""
+
+import functools
+import hashlib
+import pickle
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, as_completed
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxreg._core.cache import cache
+from jaxreg._core.typing import Key
+from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
+from jaxreg.registrar import AbstractRegistrar
+
+
+def check_executor(executor: object) -> None:
+    """Requires an executor, or None."""
+    if executor is not None and not isinstance(executor, Executor):
+        raise TypeError(
+            "executor: wanted a concurrent.futures.Executor, or None, found "
+            f"{type(executor).__name__}."
+        )
+
+
+class _Task(NamedTuple):
+    """Some pairs, and what a process needs to register them to the same bits."""
+
+    pairs: np.ndarray
+    shared: Path  # the method, the scans and the key
+    programs: str | None  # folder of compiled ones
+    x64: bool
+    versions: tuple[str, ...]
+
+
+class Workers:
+    """Registers batches of pairs elsewhere; leave it as a context to drop its file.
+
+    Args:
+        executor: whose processes see the folder for temporary files (TMPDIR).
+        method, scans, key: as in `relative_motions`.
+    """
+
+    def __init__(
+        self,
+        executor: Executor,
+        method: AbstractRegistrar,
+        scans: PreparedScans,
+        key: Key,
+    ) -> None:
+        self._executor = executor
+        host = jax.tree.map(np.asarray, (method, scans, jax.random.key_data(key)))
+        content = pickle.dumps((*host, str(jax.random.key_impl(key))), protocol=5)
+        self._folder = tempfile.TemporaryDirectory(prefix="jaxreg-scans-")
+        name = hashlib.sha256(content).hexdigest()
+        self._shared = Path(self._folder.name) / f"{name}.pickle"
+        self._shared.write_bytes(content)
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._folder.cleanup()
+
+    def registered(
+        self, batches: Sequence[np.ndarray]
+    ) -> Iterator[tuple[int, RelativeMotions]]:
+        """The motions of each batch and its number, as they come.
+
+        Where one fails, those that are under way come first; then it is raised.
+        """
+        waiting: dict[Future[RelativeMotions], int] = {}
+        failed: BaseException | None = None
+        try:
+            for number, pairs in enumerate(batches):
+                task = self._task(pairs)
+                waiting[self._executor.submit(_registered, task)] = number
+            for done in as_completed(waiting):
+                if done.cancelled():
+                    continue
+                if (error := done.exception()) is None:
+                    yield waiting[done], jax.device_put(done.result())
+                elif failed is None:
+                    failed = error
+                    _cancel(waiting)
+        finally:
+            _cancel(waiting)
+        if failed is not None:
+            raise failed
+
+    def _task(self, pairs: np.ndarray) -> _Task:
+        config: Any = jax.config  # its names are made as it runs
+        return _Task(
+            pairs,
+            self._shared,
+            config.jax_compilation_cache_dir,
+            jnp.result_type(float) == jnp.float64,
+            _versions(),
+        )
+
+
+def _cancel(waiting: Iterable[Future[RelativeMotions]]) -> None:
+    for future in waiting:
+        future.cancel()
+
+
+def _versions() -> tuple[str, ...]:
+    """Of what the bits of an answer depend on."""
+    names = ("jaxreg", "jax", "jaxlib")
+    return tuple(f"{name} {metadata.version(name)}" for name in names)
+
+
+def _registered(task: _Task) -> RelativeMotions:
+    """What a worker does.
+
+    Raises:
+        RuntimeError: if it has other versions, or does not see the caller's files.
+    """
+    here = _versions()
+    if here != task.versions:
+        raise RuntimeError(
+            f"A worker has {', '.join(here)}, the caller {', '.join(task.versions)}: "
+            "install the same on both."
+        )
+    config: Any = jax.config
+    if task.programs is not None and config.jax_compilation_cache_dir is None:
+        cache(task.programs)
+    with jax.enable_x64(task.x64):
+        try:
+            method, scans, key = _shared(task.shared)
+        except FileNotFoundError as err:
+            raise RuntimeError(
+                f"A worker does not see {task.shared}: let TMPDIR of the caller name a "
+                "folder that all machines share."
+            ) from err
+        pairs = jax.device_put(task.pairs)
+        found = relative_motions(method, scans, pairs, key)
+        return jax.tree.map(np.asarray, found)
+
+
+@functools.lru_cache(maxsize=1)
+def _shared(path: Path) -> tuple[AbstractRegistrar, PreparedScans, Key]:
+    method, scans, bits, impl = pickle.loads(path.read_bytes())
+    arrays = jax.tree.map(jnp.asarray, (method, scans))
+    return *arrays, jax.random.wrap_key_data(jnp.asarray(bits), impl=impl)
