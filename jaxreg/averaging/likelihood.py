@@ -237,9 +237,9 @@ def _among_nearest(
     place = jnp.arange(len(frame), dtype=jnp.int32)
     first = jnp.full(graph.num_poses, len(frame), jnp.int32).at[frame].min(place)
     # The t-th nearest of each frame; all are near where there are fewer.
-    last = first + jnp.asarray(_NEAREST, jnp.int32)[:, None] - 1
+    last = first[None] + jnp.asarray(_NEAREST, jnp.int32)[:, None] - 1
     there = jnp.minimum(last, len(frame) - 1)
-    own = (frame[there] == jnp.arange(graph.num_poses)) & (last < len(frame))
-    bound = jnp.where(own, ascending[there], jnp.inf)
-    near = jnp.any(far <= bound[:, ends], axis=1)
+    own = frame[there] == jnp.arange(graph.num_poses)[None]
+    bound = jnp.where(own & (last < len(frame)), ascending[there], jnp.inf)
+    near = jnp.any(far[None, None] <= bound[:, ends], axis=1)
     return jnp.concatenate([near, jnp.ones_like(near[:1])])
