@@ -183,12 +183,16 @@ class PoseGraph(eqx.Module):
         return jnp.where(mean > 0, mean, 1)
 
     @property
-    def num_held(self) -> Float[Array, ""]:
-        """The number of frames that edges hold, at least one; padding is not held."""
+    def held(self) -> Bool[Array, " v"]:
+        """Which frames edges hold; padding is not held."""
         w = self.weight
-        held = jnp.zeros((self.num_poses,), w.dtype)
-        held = held.at[self.edges[:, 0]].max(w).at[self.edges[:, 1]].max(w)
-        return jnp.maximum(jnp.sum(held > 0, dtype=w.dtype), 1)
+        most = jnp.zeros((self.num_poses,), w.dtype)
+        return most.at[self.edges[:, 0]].max(w).at[self.edges[:, 1]].max(w) > 0
+
+    @property
+    def num_held(self) -> Float[Array, ""]:
+        """The number of frames that edges hold, at least one."""
+        return jnp.maximum(jnp.sum(self.held, dtype=self.weight.dtype), 1)
 
     def predicted(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, "e D D"]:
         """What poses make of each motion: `inv(T_world_i) T_world_j`."""

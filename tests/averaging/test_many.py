@@ -92,6 +92,10 @@ def test_single_graphs_of_similar_sizes_share_programs_and_keep_their_answers():
         assert int(sol.status) == Status.CONVERGED
         np.testing.assert_allclose(sol.T_world_i, alone.T_world_i, atol=1e-5)
         np.testing.assert_allclose(sol.log_evidence, alone.log_evidence, rtol=1e-4)
+        assert sol.trace is not None
+        assert alone.trace is not None
+        steps = sol.trace.change[:2], alone.trace.change[:2]
+        np.testing.assert_allclose(*steps, rtol=1e-3, atol=1e-6)
 
 
 def test_what_a_search_draws_for_an_edge_does_not_depend_on_others():

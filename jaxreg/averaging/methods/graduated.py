@@ -175,7 +175,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         new = minimise(now, s.found.T, self.max_steps, least, s.found.cycle)
         squares = now.squares(new.T)
         trust = now.trust(squares)
-        change = pose_change(s.found.T, new.T, graph.length_scale)
+        change = pose_change(graph, graph.length_scale, s.found.T, new.T)
         trusted = weighted_mean(trust, graph.weight)
         wanted = _DEVIATIONS * self._deviation(squares, trust, width)
         next_width = jnp.clip(wanted, width / 2, width)

@@ -183,7 +183,7 @@ class _Averaging(loop.AbstractIteration[tuple[Array, Array], _State]):
         width = self.width_of(graph, state.T, before)
         trust = self.trust_of(graph, state.T, width)
         T = self.step_of(graph, state.T, trust, width)
-        moved = pose_change(state.T, T, self.scale)
+        moved = pose_change(graph, self.scale, state.T, T)
         trusted = weighted_mean(trust, graph.weight)
         rows = with_row(state.rows, state.num_steps, moved, width, trusted)
         shrinking = jnp.any(width < (1 - STILL) * before) & jnp.all(
@@ -193,14 +193,18 @@ class _Averaging(loop.AbstractIteration[tuple[Array, Array], _State]):
         return _State(T, width, change, state.num_steps + 1, rows)
 
 
-def pose_change(T_old: Array, T_new: Array, scale: Array) -> Array:
-    """The largest rotation (radians) or shift (over the size of the scene)."""
+def pose_change(
+    graph: PoseGraph, scale: Scalar, T_old: Array, T_new: Array
+) -> Float[Array, ""]:
+    """The largest rotation (radians) or shift, over the size of the scene.
+
+    That is `scale`, the graph's `length_scale`, and how far held frames spread.
+    """
     t_old, t_new = lie.translation(T_old), lie.translation(T_new)
-    spread = jnp.sqrt(
-        jnp.mean(
-            jnp.sum((t_new - jnp.mean(t_new, axis=0, keepdims=True)) ** 2, axis=-1)
-        )
-    )
+    held, count = graph.held.astype(t_new.dtype), graph.num_held
+    mean = jnp.sum(held[:, None] * t_new, axis=0) / count
+    sq = jnp.sum((t_new - mean[None]) ** 2, axis=-1)
+    spread = jnp.sqrt(jnp.sum(held * sq) / count)
     turn = jnp.sqrt(jnp.sum((lie.rotation(T_new) - lie.rotation(T_old)) ** 2, (-2, -1)))
     shift = jnp.sqrt(jnp.sum((t_new - t_old) ** 2, axis=-1)) / (scale + spread)
     return jnp.maximum(jnp.max(turn), jnp.max(shift))

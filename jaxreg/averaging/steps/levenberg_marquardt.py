@@ -244,7 +244,8 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         usual = jnp.where(kept, s.cycle.usual, jnp.maximum(rounds, 1))
         shift = jnp.max(jnp.abs(lie.translation(T) - lie.translation(s.T)))
         moved = jnp.where(kept, s.cycle.moved, 0) + jnp.where(better, shift, 0)
-        change = jnp.where(better, pose_change(s.T, T, self.length), 0)
+        moves = pose_change(graph, self.length, s.T, T)
+        change = jnp.where(better, moves, 0)
         trusted = weighted_mean(problem.trust(problem.squares(s.T)), graph.weight)
         no_width = jnp.full((2,), jnp.inf, T.dtype)
         # A cycle without damping knows nothing of a damped matrix.
