@@ -83,13 +83,9 @@ def test_its_gradient_is_that_of_the_value_that_it_is():
 
 
 @settings(max_examples=50, deadline=None)
-@given(
-    x=hnp.arrays(
-        np.float32, (N, 2), elements=st.floats(-4, 4, width=32, allow_subnormal=False)
-    ),
-    mask=hnp.arrays(bool, N),
-)
-def test_a_median_is_the_middle_of_the_valid_rows(x, mask):
+@given(seed=st.integers(0, 1000), mask=hnp.arrays(bool, N))
+def test_a_median_is_the_middle_of_the_valid_rows(seed, mask):
+    x = np.random.default_rng(seed).uniform(-4, 4, (N, 2)).astype(np.float32)
     found = jax.jit(masked_median)(jnp.asarray(x), jnp.asarray(mask))
     wanted = np.median(x[mask], axis=0) if mask.any() else np.full(2, np.nan)
-    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
