@@ -1,0 +1,52 @@
+"""Which descent follows which, and which end is kept."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxreg.averaging.likelihood import Explained
+from jaxreg.averaging.methods import annealed
+from jaxreg.averaging.steps.iterate import Iterated
+from jaxreg.averaging.trace import AveragingTrace, no_rows
+
+
+WIDTHS, SETTLING = annealed._SETTLING, annealed._SETTLING
+GOING_ON, DONE = annealed._GOING_ON, annealed._DONE
+
+
+def _end(mark: float) -> Iterated:
+    steps = jnp.asarray(1, jnp.int32)
+    return Iterated(
+        T_world_i=jnp.full((2, 4, 4), mark),
+        trust=jnp.full(1, mark),
+        width=jnp.full(2, mark),
+        converged=jnp.asarray(True),
+        num_steps=steps,
+        trace=AveragingTrace.of(no_rows(4, jnp.zeros(0).dtype), steps),
+    )
+
+
+@pytest.mark.parametrize(
+    ("stage", "log_ratio", "next_stage", "kept"),
+    [
+        (0, 9.0, 1, 2.0),  # the first width loses: half of it
+        (0, 11.0, SETTLING, 2.0),
+        (WIDTHS - 1, 9.0, SETTLING, 2.0),  # there is no narrower one
+        (SETTLING, 11.0, DONE, 2.0),
+        (SETTLING, 9.0, GOING_ON, 1.0),  # settling blurs: from the end before
+        (GOING_ON, 9.0, DONE, 2.0),
+    ],
+)
+def test_a_descent_that_loses_likelihood_is_followed_by_another(
+    stage, log_ratio, next_stage, kept
+):
+    before = annealed._Descended(
+        jnp.asarray(stage, jnp.int32), jnp.asarray(10.0), _end(1.0)
+    )
+    told = Explained(jnp.asarray(log_ratio), jnp.asarray(0.1), jnp.zeros(1))
+    after = before.followed_by(_end(2.0), told)
+    assert int(after.stage) == next_stage
+    np.testing.assert_array_equal(after.end.trust, [kept])
+    np.testing.assert_array_equal(after.end.width, [kept, kept])
+    opening = stage < SETTLING
+    assert int(after.end.num_steps) == (1 if opening or kept == 1 else 2)
