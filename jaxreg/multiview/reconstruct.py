@@ -166,15 +166,7 @@ def reconstruct(
         known = KnownWorld.of(*moved, points)
     key, order = check_key(key), _checked(order)
     if not (is_concrete(points) and is_concrete(key)):
-        if order != "any" or any(x is not None for x in (previous, on_pairs, executor)):
-            raise ValueError(
-                "order, previous, on_pairs, executor: pairs are chosen outside of jit "
-                "only."
-            )
-        if far.moved:
-            raise ValueError(
-                "scans: far from their origins, moved outside of jit only."
-            )
+        _check_can_trace(order, (previous, on_pairs, executor), far)
         solution = _of_all_pairs(method, averaging, inputs, key, known)
     else:
         told = order, previous, hold_previous, progress, on_pairs, executor
@@ -185,6 +177,15 @@ def reconstruct(
         solution = known.in_world(solution, fixed, moved=far.moved)
     log_solution("reconstruct", solution)
     return solution
+
+
+def _check_can_trace(order: Order, told: tuple[object, ...], far: FarScans) -> None:
+    if order != "any" or any(x is not None for x in told):
+        raise ValueError(
+            "order, previous, on_pairs, executor: pairs are chosen outside of jit only."
+        )
+    if far.moved:
+        raise ValueError("scans: far from their origins, moved outside of jit only.")
 
 
 def _of_chosen_pairs(
