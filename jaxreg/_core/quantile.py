@@ -72,20 +72,6 @@ def _value_of(
     return jnp.where(count > 0, lax.bitcast_convert_type(found, x.dtype), 0)
 
 
-def masked_median(
-    x: Float[Array, "n ..."], mask: Bool[Array, " n"]
-) -> Float[Array, "..."]:
-    """The median of the valid rows, the mean of two where their number is even.
-
-    NaN where there are none. `jnp.nanmedian` compiles for three times as long.
-    """
-    count = jnp.sum(mask, dtype=jnp.int32)
-    outside = ~mask.reshape(-1, *[1] * (x.ndim - 1))
-    ascending = jnp.sort(jnp.where(outside, jnp.inf, x), axis=0)
-    middle = (ascending[(count - 1) // 2] + ascending[count // 2]) / 2
-    return jnp.where(count > 0, middle, jnp.nan)
-
-
 def nearest_rank(
     x: Float[Array, " e"], mask: Bool[Array, " e"], q: float | Array
 ) -> Float[Array, ""]:

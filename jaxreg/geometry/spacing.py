@@ -6,7 +6,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core import control
 from jaxreg._core.arrays import spread_rows
-from jaxreg._core.quantile import masked_median
 from jaxreg._core.typing import Mask, Points
 
 
@@ -28,7 +27,8 @@ def median_spacing(points: Points, mask: Mask) -> Float[Array, ""]:
     sq = jnp.sum((points[at] - points[other]) ** 2, axis=1)
     use = use & (other >= 0) & (sq > 0)
     distance = jnp.sqrt(jnp.where(use, sq, 1))
-    return jnp.where(jnp.any(use), masked_median(distance, use), 0)
+    spacing = jnp.nanmedian(jnp.where(use, distance, jnp.nan))
+    return jnp.where(jnp.any(use), spacing, 0)
 
 
 def _other(

@@ -7,6 +7,7 @@
 import functools
 import hashlib
 import pickle
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, as_completed
@@ -33,6 +34,10 @@ def check_executor(executor: object) -> None:
             "executor: wanted a concurrent.futures.Executor, or None, found "
             f"{type(executor).__name__}."
         )
+
+
+class WorkerError(RuntimeError):
+    """A worker of other versions, or one that does not see the caller's files."""
 
 
 class _Task(NamedTuple):
@@ -123,19 +128,20 @@ def _cancel(waiting: Iterable[Future[RelativeMotions]]) -> None:
 
 def _versions() -> tuple[str, ...]:
     """Of what the bits of an answer depend on."""
-    names = ("jaxreg", "jax", "jaxlib")
-    return tuple(f"{name} {metadata.version(name)}" for name in names)
+    own = sys.modules["jaxreg"].__version__  # it imports this file
+    others = (f"{name} {metadata.version(name)}" for name in ("jax", "jaxlib"))
+    return f"jaxreg {own}", *others
 
 
 def _registered(task: _Task) -> RelativeMotions:
     """What a worker does.
 
     Raises:
-        RuntimeError: if it has other versions, or does not see the caller's files.
+        WorkerError: if it has other versions, or does not see the caller's files.
     """
     here = _versions()
     if here != task.versions:
-        raise RuntimeError(
+        raise WorkerError(
             f"A worker has {', '.join(here)}, the caller {', '.join(task.versions)}: "
             "install the same on both."
         )
@@ -146,7 +152,7 @@ def _registered(task: _Task) -> RelativeMotions:
         try:
             method, scans, key = _shared(task.shared)
         except FileNotFoundError as err:
-            raise RuntimeError(
+            raise WorkerError(
                 f"A worker does not see {task.shared}: let TMPDIR of the caller name a "
                 "folder that all machines share."
             ) from err

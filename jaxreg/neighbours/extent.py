@@ -4,7 +4,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import spread_rows
-from jaxreg._core.quantile import masked_median
 from jaxreg._core.typing import Mask, Points
 
 
@@ -23,10 +22,9 @@ def bulk_extent(
     Of none the first is inf and the second -inf, or NaN.
     """
     some, use = spread_rows(mask, _SAMPLES)
-    sample = points[some]
-    centre = masked_median(sample, use)
-    farthest = jnp.max(jnp.abs(sample - centre[None]), axis=1)
-    reach = _REACH * masked_median(farthest, use)
+    sample = jnp.where(use[:, None], points[some], jnp.nan)
+    centre = jnp.nanmedian(sample, axis=0)
+    reach = _REACH * jnp.nanmedian(jnp.max(jnp.abs(sample - centre[None]), axis=1))
     low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0)
     high = jnp.max(jnp.where(mask[:, None], points, -jnp.inf), axis=0)
     return jnp.maximum(low, centre - reach), jnp.minimum(high, centre + reach)

@@ -34,6 +34,7 @@ from jaxreg.app.views import open_where_seen
 from jaxreg.io.errors import InputError
 from jaxreg.io.graphs.g2o_known import KnownOfGraph
 from jaxreg.io.poses.stanford import read_conf
+from jaxreg.multiview.workers import WorkerError
 
 
 def run(command: Multiview, session: Session) -> int:
@@ -83,6 +84,8 @@ def run(command: Multiview, session: Session) -> int:
             f"--cluster {command.cluster}: a process ended before its pairs were "
             f"registered, as for want of memory.\n{_kept(log)}"
         ) from err
+    except WorkerError as err:
+        raise InputError(f"--cluster {command.cluster}: {err}\n{_kept(log)}") from err
     finally:
         if view is not None:
             view.close()

@@ -32,7 +32,7 @@ from jaxreg.linear.laplacian import DENSE_LIMIT
 _HEAT = (0.25, 2.0)
 
 
-# Poses that are compared side by side, at most: about what fits a CPU's caches.
+# Poses that are compared side by side, at most.
 _GROUP = 12
 
 
@@ -80,7 +80,7 @@ class CycleConsensus(AbstractStart):
         return of_start(self, graph, _with_trust(held, self._best(held, key)))
 
     def poses(self, graph: PoseGraph, key: Key | None) -> Float[Array, "v D D"]:
-        """The likeliest poses; asking for derivatives gets zeros."""
+        """The likeliest poses, of a graph that is held: a start has no derivative."""
         if not judged(graph, self.max_cycles):
             return _by_trees(graph)
         return self._best(graph, key).T
