@@ -218,6 +218,16 @@ WORKLOADS = {
         "registrations were spent.",
         quick=False,
     ),
+    "many_scans": Workload(
+        "Ten thousand scans: all but the search",
+        "Scans of 400 points along a street, or of an object from all sides. What the "
+        "search would say of a pair is drawn from the truth, right where scans share "
+        "0.3 of what they see, else wrong, and once in a thousand believed all the "
+        "same; what is timed is the rest of `reconstruct`: preparing scans, choosing "
+        "pairs, averaging, measuring overlapping pairs again, judging.",
+        cores="all",
+        quick=False,
+    ),
     "command_line": Workload(
         "What a person waits for at the terminal",
         "Commands as processes of their own, from an empty folder to written files, "

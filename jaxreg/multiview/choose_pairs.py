@@ -14,7 +14,8 @@ pairs.
 from typing import Literal
 
 import numpy as np
-from scipy.sparse.csgraph import shortest_path
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
 
 
 Order = Literal["any", "sequential"]
@@ -23,10 +24,14 @@ Order = Literal["any", "sequential"]
 ALL_UP_TO, _PAIRS_PER_SCAN = 20, 10
 # Partners of each scan in a first round, in the given order and in a random one.
 _IN_ORDER, _AT_RANDOM = 2, 3
-# Tries of a part that is not joined, a scan and round.
-_TRIES = 3
+# Tries of a part that is not joined, a scan and round, and draws for them: a part is at
+# most half of all, and few of its pairs with others were tried.
+_TRIES, _DRAWS = 3, 64
 #: A scan is safe by so many trusted pairs; a loop has so many pairs or more.
 SAFE, _LOOP = 3, 4
+# Longer loops are as good as one of so many pairs; hops are counted from so many scans
+# at a time.
+_LONG, _FROM = 32, 256
 #: Scans are taken to overlap by the poses from this share on.
 LIKELY = 0.2
 
@@ -53,50 +58,87 @@ def first_pairs(num_scans: int, order: Order, rng: np.random.Generator) -> np.nd
     """
     if num_scans <= ALL_UP_TO and order == "any":
         return all_pairs(num_scans)
-    chosen = np.zeros((num_scans, num_scans), bool)
-    for step in range(1, _IN_ORDER + 1):
-        chosen[np.arange(num_scans - step), np.arange(step, num_scans)] = True
+    ids = np.arange(num_scans)
+    chosen = [(ids[:-step], ids[step:]) for step in range(1, _IN_ORDER + 1)]
     if order == "any":
         ring = rng.permutation(num_scans)
-        for step in range(1, _AT_RANDOM + 1):
-            chosen[ring, np.roll(ring, step)] = True
-    return _ascending(chosen)
+        chosen += [(ring, np.roll(ring, step)) for step in range(1, _AT_RANDOM + 1)]
+    return ascending(np.concatenate([np.stack(x, axis=1) for x in chosen]))
 
 
 def next_pairs(
     tried: np.ndarray,
     trusted: np.ndarray,
-    likely: np.ndarray,
+    near: np.ndarray,
+    overlap: np.ndarray,
     part: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:
     """The pairs of a later round, `(e, 2)` int32; none where nothing is left to settle.
 
     Args:
-        tried: `(v, v)` symmetric, the pairs that were registered.
-        trusted: `(v, v)` symmetric, those of them that are trusted.
-        likely: `(v, v)` symmetric, overlap by the present poses, 0 where not known.
+        tried: `(t, 2)` the pairs i < j that were registered.
+        trusted: `(t,)` which of them are trusted.
+        near: `(c, 2)` pairs i < j that may overlap by the present poses.
+        overlap: `(c,)` how much they do.
         part: `(v,)` which scans hang together.
         rng: of the caller.
     """
-    num = len(tried)
-    open_ = ~tried & ~np.eye(num, dtype=bool)
-    chosen = np.zeros((num, num), bool)
-    largest = np.bincount(part).argmax()
-    for i in np.flatnonzero(part != largest):
-        others = np.flatnonzero(open_[i] & (part != part[i]))
-        chosen[i, rng.permutation(others)[:_TRIES]] = True
-    overlap = np.where(open_ & (likely >= LIKELY), likely, 0)
-    hops = shortest_path(trusted, unweighted=True)
-    loop = np.where(hops >= _LOOP, overlap * np.minimum(hops, num), 0)
-    weak = np.sum(trusted, axis=1) < SAFE
-    for i in np.flatnonzero(part == largest):
-        for worth in (loop[i], overlap[i] * weak[i]):
-            if worth.max() > 0:
-                chosen[i, worth.argmax()] = True
-    return _ascending(chosen)
+    num = len(part)
+    done = pair_keys(tried, num)
+    chosen = [_joining(done, part, rng)]
+    open_ = ~np.isin(pair_keys(near, num), done) & (overlap >= LIKELY)
+    open_ &= part[near[:, 0]] == np.bincount(part).argmax()
+    both = np.concatenate([near[open_], near[open_][:, ::-1]])
+    worth = np.tile(overlap[open_], 2)
+    hops = _hops(tried[trusted], both, num)
+    few = np.bincount(tried[trusted].ravel(), minlength=num) < SAFE
+    for value in (np.where(hops >= _LOOP, worth * hops, 0), worth * few[both[:, 0]]):
+        chosen.append(_best_of_each(both, value))
+    return ascending(np.concatenate(chosen))
 
 
-def _ascending(chosen: np.ndarray) -> np.ndarray:
-    pairs = np.argwhere(np.triu(chosen | chosen.T, 1))
-    return pairs.astype(np.int32)
+def pair_keys(pairs: np.ndarray, num_scans: int) -> np.ndarray:
+    """`(e,)` int64, one number for each pair i < j."""
+    return pairs[:, 0].astype(np.int64) * num_scans + pairs[:, 1]
+
+
+def ascending(pairs: np.ndarray) -> np.ndarray:
+    """Each pair once, as i < j, sorted; `(e, 2)` int32."""
+    pairs = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
+    return np.unique(pairs, axis=0).astype(np.int32)
+
+
+def _joining(
+    done: np.ndarray, part: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """From each scan outside of the largest part some pairs with other parts."""
+    num, chosen = len(part), []
+    for i in np.flatnonzero(part != np.bincount(part).argmax()):
+        others = np.unique(rng.integers(num, size=_DRAWS))
+        others = rng.permutation(others[part[others] != part[i]])
+        pairs = np.stack([np.minimum(i, others), np.maximum(i, others)], axis=1)
+        chosen.append(pairs[~np.isin(pair_keys(pairs, num), done)][:_TRIES])
+    return np.concatenate([np.zeros((0, 2), int), *chosen])
+
+
+def _hops(trusted: np.ndarray, pairs: np.ndarray, num: int) -> np.ndarray:
+    """Trusted pairs on the way between two scans, of many `_LONG`."""
+    i, j = trusted.T
+    ways = coo_array((np.ones(len(i)), (i, j)), (num, num)).tocsr()
+    out = np.zeros(len(pairs))
+    scans, row = np.unique(pairs[:, 0], return_inverse=True)
+    for start in range(0, len(scans), _FROM):
+        some = scans[start : start + _FROM]
+        hops = dijkstra(ways, False, some, unweighted=True, limit=_LONG)
+        these = (row >= start) & (row < start + len(some))
+        out[these] = hops[row[these] - start, pairs[these, 1]]
+    return np.minimum(out, _LONG)
+
+
+def _best_of_each(pairs: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Of each first scan the pair of largest value, if that is above zero."""
+    pairs, value = pairs[value > 0], value[value > 0]
+    order = np.lexsort((pairs[:, 1], -value, pairs[:, 0]))
+    _, first = np.unique(pairs[order, 0], return_index=True)
+    return pairs[order][first]

@@ -15,6 +15,7 @@ from jaxreg.multiview.find_slipping import slipping
 from jaxreg.multiview.find_turnable import turnable
 from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.known_world import KnownWorld
+from jaxreg.multiview.likely_overlap import LikelyOverlap
 from jaxreg.multiview.method import min_log_evidence
 from jaxreg.multiview.near_pairs import near_pairs
 from jaxreg.multiview.pair_trust import pair_trust
@@ -37,6 +38,7 @@ def finish(
     motions: RelativeMotions,
     hold: Held | None = None,
     known: KnownWorld | None = None,
+    overlaps: LikelyOverlap | None = None,
 ) -> ReconstructionSolution:
     """Averages, refines, and returns to the frames and unit of the input.
 
@@ -47,18 +49,22 @@ def finish(
         motions: of pairs, in the scans' centred frames; some may be padding.
         hold: old frames that stay, or None.
         known: what is known of the world, less its origin, or None.
+        overlaps: what is known of them; None under `jit`.
     """
     moving, scans = scans, lax.stop_gradient(scans)
     least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
     placement = place(motions, scans.num_scans, averaging, least)
     mode, turns = placement.mode, turnable(motions, placement)
-    pairs, likely = near_pairs(scans, placement, motions), least - _VOUCHED
-    placement, measured = refine(moving, placement, averaging, likely, pairs)
+    pairs = near_pairs(scans, placement, motions, overlaps)
+    likely = least - _VOUCHED
     if hold is not None:
+        pairs = hold.of_new(pairs)
         placement = hold.place(scans, placement, averaging, likely, pairs)
-        free = (turns | slipping(scans, placement, least, pairs)) & ~hold.held
+        free = turns | slipping(scans, placement, least, pairs, hold.held)
+        free = free & ~hold.held
         solution = _solution(scans, motions, mode, placement, free, least)
         return hold.in_world(solution)
+    placement, measured = refine(moving, placement, averaging, likely, pairs)
     free = turns | slipping(scans, placement, least, pairs)
     if known is None:
         return _solution(moving, motions, mode, placement, free, least)

@@ -25,7 +25,7 @@ from jaxreg.matching.problem import match
 from jaxreg.multiview.check_scans import padded_scans
 from jaxreg.multiview.far_scans import FarScans
 from jaxreg.multiview.prepare import PreparedScans, prepare_scans
-from jaxreg.multiview.refine import WIDTH_END, optimiser_of, problem_of
+from jaxreg.multiview.refine import WIDTH_END, optimiser_of
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.particle import ParticleFilter
 
@@ -166,7 +166,7 @@ class _Graph(eqx.Module):
         self, i: Array, j: Array, around: Float[Array, "r v k"]
     ) -> Float[Array, "r c k"]:
         """What each cell adds to the right tangent of `T_i_j`."""
-        optimiser, problem = optimiser_of(self.T), problem_of(self.scans, i, j, True)
+        optimiser, problem = optimiser_of(self.T), self.scans.problem(i, j, exact=True)
         width = WIDTH_END * jnp.max(self.scans.spacing)
         cell, ends = self._cells(i), jnp.stack([i, j])
 

@@ -138,7 +138,8 @@ class FarScans:
     ) -> ReconstructionSolution:
         # The world of a component is the frame of its first scan.
         component = np.asarray(solution.component)
-        first = np.argmax(component[:, None] == component, axis=1)
+        _, first, row = np.unique(component, return_index=True, return_inverse=True)
+        first = first[row]
         origin = self.origin[: len(component)]
         there = origin[first]
         if world is not None:

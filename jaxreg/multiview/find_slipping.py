@@ -14,15 +14,21 @@ from jaxreg._core import control
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
 from jaxreg.geometry import lie
+from jaxreg.graph.joined import joined
 from jaxreg.graph.trees import components
 from jaxreg.matching import Grip
-from jaxreg.multiview.place import Placement, in_main_body
+from jaxreg.multiview.in_blocks import in_blocks
+from jaxreg.multiview.parts import in_main_body
+from jaxreg.multiview.place import Placement
 from jaxreg.multiview.prepare import PreparedScans
 
 
-@kept_program
 def slipping(
-    scans: PreparedScans, placement: Placement, least: Scalar, pairs: Int[Array, "p 2"]
+    scans: PreparedScans,
+    placement: Placement,
+    least: Scalar,
+    pairs: Int[Array, "p 2"],
+    held: Bool[Array, " v"] | None = None,
 ) -> Bool[Array, " v"]:
     """`(v,)` scans that can move along the main body of their part.
 
@@ -31,15 +37,24 @@ def slipping(
         placement: their final poses.
         least: log evidence of the pairs that count.
         pairs: those that may overlap (`near_pairs`).
+        held: scans that are one body from the start, None if there are none.
     """
-    body = _bodies(pairs, _grips(scans, placement, pairs, least), scans.num_scans)
-    return ~in_main_body(body, placement.part)
+
+    def run(block: Array) -> Grip:
+        return _grips(scans, placement, block, least)
+
+    grips = in_blocks(run, pairs, (scans, placement))
+    body = jnp.arange(scans.num_scans, dtype=jnp.int32)
+    if held is not None:
+        body = jnp.where(held, jnp.argmax(held).astype(jnp.int32), body)
+    return _apart(pairs, grips, placement.part, body)
 
 
+@kept_program
 def _grips(
     scans: PreparedScans,
     placement: Placement,
-    pairs: Int[Array, "e 2"],
+    pairs: Int[Array, "b 2"],
     least: Scalar,
 ) -> Grip:
     """Of every pair that is likely, in the world's frame; nothing of the others."""
@@ -57,19 +72,31 @@ def _grips(
     return lax.map(one, pairs)
 
 
+@kept_program
+def _apart(
+    pairs: Int[Array, "p 2"],
+    grips: Grip,
+    part: Int[Array, " v"],
+    body: Int[Array, " v"],
+) -> Bool[Array, " v"]:
+    """Bodies at the start are told by the lowest numbers of their scans."""
+    body = _bodies(body[pairs], grips, part.shape[0])[body]
+    return ~in_main_body(body, part)
+
+
 def _bodies(pairs: Int[Array, "e 2"], grips: Grip, num_scans: int) -> Int[Array, " v"]:
     """The lowest number of the scans of each scan's body."""
 
     def between(body: Int[Array, " v"]) -> Bool[Array, " e"]:
-        a, b = body[pairs[:, 0]], body[pairs[:, 1]]
-        row = jnp.minimum(a, b) * num_scans + jnp.maximum(a, b)
-        sums = jax.tree.map(lambda x: jax.ops.segment_sum(x, row, num_scans**2), grips)
-        return sums.holds[row] | (a == b)
+        ends = body[pairs]
+        row = joined(ends).row
+        sums = jax.tree.map(lambda x: jax.ops.segment_sum(x, row, len(row)), grips)
+        return sums.holds[row] | (ends[:, 0] == ends[:, 1])
 
-    def joined(state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def merged(state: tuple[Array, Array]) -> tuple[Array, Array]:
         body, _ = state
         new = components(pairs, between(body).astype(grips.count.dtype), num_scans)
         return new, jnp.any(new != body)
 
     start = jnp.arange(num_scans, dtype=jnp.int32)
-    return control.while_loop(lambda s: s[1], joined, (start, jnp.asarray(True)))[0]
+    return control.while_loop(lambda s: s[1], merged, (start, jnp.asarray(True)))[0]

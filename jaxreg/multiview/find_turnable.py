@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool
 
 from jaxreg._core.programs import kept_program
 from jaxreg.graph.trees import components
-from jaxreg.multiview.place import Placement, in_main_body, joins
+from jaxreg.multiview.parts import in_main_body
+from jaxreg.multiview.place import Placement, joins
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.particle.conclude import RIVAL_MARGIN
 

@@ -14,7 +14,7 @@ from jaxreg._core.arrays import cast_floats
 from jaxreg._core.programs import kept_program
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
-from jaxreg.matching import NO_EVIDENCE, PlaneToPlane, Problem
+from jaxreg.matching import NO_EVIDENCE, PlaneToPlane
 from jaxreg.multiview.method import follower, log_prior
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -44,7 +44,7 @@ def descended(
 
     def one(row: tuple[Array, Array]) -> RelativeMotions:
         (i, j), T = row
-        problem = Problem.of(scans.cloud(j), scans.cloud(i), scans.table(i))
+        problem = scans.problem(i, j)
         spacing = jnp.maximum(scans.spacing[i], scans.spacing[j])
         widths = jnp.geomspace(widest, 0.5 * spacing, _STEPS).astype(dtype)
         T = lie.straightened(coarse.repeat(problem, T, widths))

@@ -5,13 +5,16 @@ to any of them say where the new scan lies in the old world.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
+from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.place import Placement, place
@@ -47,6 +50,13 @@ class Held(eqx.Module):
         node = np.where(held, 0, np.cumsum(~held)).astype(np.int32)
         return cls(jnp.asarray(T), jnp.asarray(held), jnp.asarray(node))
 
+    def of_new(self, pairs: Int[Array, "p 2"]) -> Int[Array, "q 2"]:
+        """Those of them that have to be measured: not those of scans that stay."""
+        ids, held = np.asarray(pairs), np.asarray(self.held)
+        ids = ids[(ids[:, 0] != ids[:, 1]) & ~held[ids].all(axis=1)]
+        more = rounded_up(len(ids)) - len(ids)
+        return jax.device_put(np.pad(ids, ((0, more), (0, 0))).astype(np.int32))
+
     def place(
         self,
         scans: PreparedScans,
@@ -62,14 +72,16 @@ class Held(eqx.Module):
             found: where all of them lie, none held.
             averaging: as in `place`.
             least: log evidence of the pairs that count.
-            pairs: those that may overlap (`near_pairs`).
+            pairs: those that may overlap (`near_pairs`), of scans that do not stay.
         """
-        before = _brought(self, scans, found)
-        motions = measured(scans, before, least, pairs, exact=True)
+        averaging, placed = wide_unless_given(averaging), _brought(self, scans, found)
         num_nodes = 1 + int(np.max(np.asarray(self.node)))
-        motions = _contracted(self, before, motions)
-        nodes = place(motions, num_nodes, wide_unless_given(averaging), least)
-        return _expanded(self, before, nodes)
+        for exact in (False, True):
+            motions = measured(scans, placed, least, pairs, exact=exact)
+            motions = _contracted(self, placed, motions)
+            nodes = place(motions, num_nodes, averaging, least)
+            placed = _expanded(self, placed, nodes)
+        return placed
 
     def in_world(self, solution: ReconstructionSolution) -> ReconstructionSolution:
         """A solution in the world of those that stay, which have their very poses."""
@@ -92,14 +104,19 @@ def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
     T_one_i = lie.between(hold.T_world_i[one], hold.T_world_i)
     T_held = scans.to_centred_frames(T_one_i, jnp.full_like(ids, one), ids)
     centre = lie.translation(found.T_world_i)
-    far = jnp.sum((centre[:, None] - centre[None, :]) ** 2, axis=-1)
-    beside = hold.held[None, :] & (found.part[:, None] == found.part[None, :])
-    near = jnp.argmin(jnp.where(beside, far, jnp.inf), axis=1)
+
+    def nearest(scan: tuple[Array, Array]) -> tuple[Array, Array]:
+        here, part = scan
+        beside = hold.held & (found.part == part)
+        far = jnp.sum((centre - here) ** 2, axis=-1)
+        return jnp.argmin(jnp.where(beside, far, jnp.inf)), jnp.any(beside)
+
+    near, has_held = lax.map(nearest, (centre, found.part))
     T_near_i = lie.between(found.T_world_i[near], found.T_world_i)
-    stays = hold.held | ~jnp.any(beside, axis=1)
+    stays = hold.held | ~has_held
     T = jnp.where(hold.held[:, None, None], T_held, T_held[near] @ T_near_i)
     T = jnp.where((stays & ~hold.held)[:, None, None], found.T_world_i, T)
-    with_held = hold.held | jnp.any(beside, axis=1)
+    with_held = hold.held | has_held
     part = jnp.where(with_held, jnp.argmax(with_held).astype(jnp.int32), found.part)
     return eqx.tree_at(lambda p: (p.T_world_i, p.part), found, (T, part))
 

@@ -5,7 +5,6 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
@@ -20,8 +19,10 @@ from jaxreg.averaging import (
 )
 from jaxreg.geometry import lie
 from jaxreg.graph.hang import with_hung
+from jaxreg.graph.joined import in_loops_of_three, joined
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import components
+from jaxreg.multiview.parts import part_numbers, part_sizes
 from jaxreg.multiview.relative_motions import RelativeMotions
 
 
@@ -63,20 +64,8 @@ class Placement(eqx.Module):
 
     @property
     def component(self) -> Int[Array, " v"]:
-        """`(v,)` number of each scan's part, the largest first; -1 of scans alone.
-
-        Where every scan is alone, the first of them is the largest part. The part that
-        lies in a known world comes before all.
-        """
-        size = part_sizes(self.part)
-        size = jnp.where(self.part == self.world, size + len(size), size)
-        ids = jnp.arange(len(size), dtype=jnp.int32)
-        first = self.part == ids
-        larger = size[None, :] > size[:, None]
-        same = size[None, :] == size[:, None]
-        before = larger | (same & (self.part[None, :] < self.part[:, None]))
-        number = jnp.sum(first[None, :] & before, axis=1).astype(jnp.int32)
-        return jnp.where((size > 1) | (number == 0), number, -1)
+        """`(v,)` number of each scan's part, the largest first; -1 of scans alone."""
+        return part_numbers(self.part, self.world)
 
     @property
     def placed(self) -> Bool[Array, " v"]:
@@ -183,18 +172,6 @@ def displacement(
     return lie.rotation_angle(R), jnp.sqrt(jnp.sum(shift**2, axis=-1))
 
 
-def part_sizes(part: Int[Array, " v"]) -> Int[Array, " v"]:
-    """How many scans are of each scan's part."""
-    return jnp.sum(part[:, None] == part[None, :], axis=1)
-
-
-def in_main_body(body: Int[Array, " v"], part: Int[Array, " v"]) -> Bool[Array, " v"]:
-    """Whether each scan's body is the largest in its part."""
-    same = part[:, None] == part[None, :]
-    largest = jnp.argmax(jnp.where(same, part_sizes(body)[None, :], 0), axis=1)
-    return body == body[largest]
-
-
 def likely(motions: RelativeMotions, least: Scalar) -> Bool[Array, "e m"]:
     """Which modes count where others confirm them."""
     return motions.log_evidence >= least - _CONFIRMABLE
@@ -226,18 +203,22 @@ def _confirmed_components(
     that wrong ones agree with the poses by chance is far less likely than any one of
     them being wrong. What they join is one part from then on.
     """
+    ones = jnp.ones(len(weight), jnp.int32)
 
-    def joined(state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def merged(state: tuple[Array, Array]) -> tuple[Array, Array]:
         part, _ = state
-        i, j = part[pairs[:, 0]], part[pairs[:, 1]]
-        count = jnp.zeros((num_scans, num_scans), weight.dtype)
-        one = ((weight > 0) & (i != j)).astype(weight.dtype)
-        count = count.at[i, j].add(one).at[j, i].add(one)
-        beside = (count > 0).astype(weight.dtype)
-        loop = jnp.matmul(beside, beside, precision=lax.Precision.HIGHEST)
-        confirmed = (i == j) | (count[i, j] >= 2) | (loop[i, j] > 0)
+        ends = part[pairs]
+        within = ends[:, 0] == ends[:, 1]
+        present = (weight > 0) & ~within
+        # Pairs that do not count are of no two parts.
+        ends = jnp.where(present[:, None], ends, num_scans - 1)
+        same = joined(ends)
+        twice = jax.ops.segment_sum(ones, same.row, len(ones))[same.row] >= 2
+        loop = in_loops_of_three(ends, present & same.first, num_scans)
+        loop = jax.ops.segment_max(loop.astype(jnp.int32), same.row, len(ones))
+        confirmed = within | twice | (loop[same.row] > 0)
         new = components(pairs, jnp.where(confirmed, weight, 0), num_scans)
         return new, jnp.any(new != part)
 
     core = components(pairs, jnp.where(strong, weight, 0), num_scans)
-    return control.while_loop(lambda s: s[1], joined, (core, jnp.asarray(True)))[0]
+    return control.while_loop(lambda s: s[1], merged, (core, jnp.asarray(True)))[0]

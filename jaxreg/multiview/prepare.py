@@ -20,11 +20,16 @@ from jaxreg.cloud import (
     rms_radius,
 )
 from jaxreg.geometry import lie
-from jaxreg.matching import Witness
+from jaxreg.matching import Problem, Witness
 from jaxreg.multiview.method import index_of
 from jaxreg.multiview.positions import ScanPositions
-from jaxreg.neighbours import AbstractIndex, index_within
+from jaxreg.neighbours import AbstractIndex, exact_index, index_within
 from jaxreg.registrar import AbstractRegistrar
+
+
+# Scans whose tables are held, a megabyte each; of more they are made when needed, 10 ms
+# each, where the search of a pair takes 200.
+_MOST_TABLES = 512
 
 
 class PreparedScans(eqx.Module):
@@ -33,7 +38,7 @@ class PreparedScans(eqx.Module):
     Attributes:
         clouds: `(v, n, d)` thinned points with normals; the unit is `radius`. With what
             was seen from the viewpoints, where these are given.
-        tables: their indexes, of the method's kind.
+        tables: their indexes, of the method's kind; None of very many scans.
         exact: indexes that miss no near point, for the evidence.
         mean: `(v, d)` centroid of each scan in its input frame.
         radius: the median root mean square radius of the scans, in the input's unit.
@@ -46,7 +51,7 @@ class PreparedScans(eqx.Module):
     """
 
     clouds: PointCloud
-    tables: AbstractIndex
+    tables: AbstractIndex | None
     exact: AbstractIndex
     mean: Float[Array, "v d"]
     radius: Scalar
@@ -74,9 +79,29 @@ class PreparedScans(eqx.Module):
         """One scan's thinned points."""
         return jax.tree.map(lambda x: x[i], self.clouds)
 
-    def table(self, i: Int[Array, ""]) -> AbstractIndex:
-        """One scan's index."""
+    def table(self, method: AbstractRegistrar, i: Int[Array, ""]) -> AbstractIndex:
+        """One scan's index, of the method's kind."""
+        if self.tables is None:
+            return index_of(method.in_frames(self.frames(i, i)), self.cloud(i))
         return jax.tree.map(lambda x: x[i], self.tables)
+
+    def problem(
+        self, i: Int[Array, ""], j: Int[Array, ""], *, exact: bool = False
+    ) -> Problem:
+        """Scan j as the source, scan i as the target, its closest points from a table.
+
+        Args:
+            i: of the target.
+            j: of the source.
+            exact: no near point is missed; so it is where no tables are held.
+        """
+        source, target = self.cloud(j), self.cloud(i)
+        if not exact and self.tables is not None:
+            return Problem.of(source, target, jax.tree.map(lambda x: x[i], self.tables))
+        if target.judged is None:  # whose index is that of the evidence
+            return Problem.of(source, target, jax.tree.map(lambda x: x[i], self.exact))
+        kind = exact_index(target.points.shape[0])
+        return Problem.of(source, target, kind.build(target.points, target.mask))
 
     def witness(self, i: Int[Array, ""], j: Int[Array, ""]) -> Witness:
         """Who tells how likely motions of scan j into scan i are."""
@@ -142,18 +167,20 @@ def prepare_scan(
     points: Float[Array, "n d"],
     mask: Bool[Array, " n"],
     radius: Scalar,
-) -> tuple[PointCloud, AbstractIndex, AbstractIndex, Float[Array, " d"], Scalar]:
+    *,
+    with_table: bool,
+) -> tuple[PointCloud, AbstractIndex | None, AbstractIndex, Float[Array, " d"], Scalar]:
     """One scan: cloud, table, exact index, centroid and spacing."""
     mean = centroid(points, mask)
     method = method.in_frames(Frames(mean, mean, radius))
     centred = (points - mean[None]) / radius
     cloud = method.prepare(centred, mask).followed().with_spacing()
-    table = index_of(method, cloud)
     spacing = median_spacing(cloud.points, cloud.mask)
     judged, within = cloud.as_judged, spacing
     if cloud.judged is not None:
         within = median_spacing(judged.points, judged.mask)
     exact = index_within(judged.points, judged.mask, within)
+    table = index_of(method, cloud) if with_table else None
     return cloud, table, exact, mean, spacing
 
 
@@ -176,7 +203,8 @@ def prepare_scans(
     radius = common_radius(points, mask)
 
     def one(scan: tuple[Array, Array]) -> tuple:
-        return prepare_scan(method, *scan, radius)
+        held = len(points) <= _MOST_TABLES
+        return prepare_scan(method, *scan, radius, with_table=held)
 
     every = jax.vmap(one) if side_by_side else partial(lax.map, one)
     clouds, tables, exact, mean, spacing = every((points, mask))

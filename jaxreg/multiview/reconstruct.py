@@ -212,19 +212,21 @@ def _of_chosen_pairs(
     prepared = jax.block_until_ready(prepare_scans(method, *inputs))
     report("preparing scans", 1, 1)
     before, first = _known(previous, prepared, order)
+    hold = None
+    if hold_previous and isinstance(previous, ReconstructionSolution):
+        hold = Held.of(previous, prepared.num_scans)
     with contextlib.ExitStack() as stack:
         workers = None
         if executor is not None:
             workers = stack.enter_context(Workers(executor, method, prepared, key))
-        told = before, on_pairs, report, workers
+        held = None if hold is None else np.asarray(hold.held)
+        told = before, on_pairs, report, workers, held
         rounds = Rounds(method, averaging, prepared, key, *told)
         motions = rounds.run(order, first)
     report("averaging and refining", 0, 1)
-    hold = None
-    if hold_previous and isinstance(previous, ReconstructionSolution):
-        hold = Held.of(previous, prepared.num_scans)
     motions_padded = motions.padded(rounds.most)
-    solution = finish(method, averaging, prepared, motions_padded, hold, known)
+    told = hold, known, rounds.overlaps
+    solution = finish(method, averaging, prepared, motions_padded, *told)
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
     return solution.of_pairs(len(motions.overlap))

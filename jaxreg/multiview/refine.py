@@ -9,7 +9,6 @@ are not noise but warps, which the median of many pairs evens out.)
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -21,12 +20,13 @@ from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
-from jaxreg.matching import NO_EVIDENCE, Evidence, PlaneToPlane, Problem
+from jaxreg.matching import NO_EVIDENCE, Evidence, PlaneToPlane
 from jaxreg.multiview.follow_points import follow_points
-from jaxreg.multiview.place import Placement, part_sizes, place
+from jaxreg.multiview.in_blocks import in_blocks
+from jaxreg.multiview.parts import first_where, in_main_body, part_sizes
+from jaxreg.multiview.place import Placement, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
-from jaxreg.neighbours import exact_index
 from jaxreg.robust import GemanMcClure
 
 
@@ -88,20 +88,14 @@ def _updated(before: Placement, after: Placement) -> Placement:
     Of each earlier part, the largest of the later parts in it is held.
     """
     ids = jnp.arange(before.part.shape[0], dtype=jnp.int32)
-    same = before.part[:, None] == before.part[None, :]
-    size = part_sizes(after.part)
-    rank = jnp.where(same, size[None, :], 0)
-    chosen = after.part[jnp.argmax(rank, axis=1)]
-    held = (after.part == chosen) & (part_sizes(before.part) > 1)
-    first = jnp.argmax(same & held[None, :], axis=1).astype(jnp.int32)
-    first = jnp.where(held, first, ids)
+    held = in_main_body(after.part, before.part) & (part_sizes(before.part) > 1)
+    first = jnp.where(held, first_where(before.part, held), ids)
     T_before_after = before.T_world_i @ lie.inverse(after.T_world_i)
     T = T_before_after[first] @ after.T_world_i
     T = jnp.where(held[:, None, None], T, before.T_world_i)
     return eqx.tree_at(lambda p: (p.T_world_i, p.part), before, (T, first))
 
 
-@kept_program
 def measured(
     scans: PreparedScans,
     placement: Placement,
@@ -111,13 +105,30 @@ def measured(
     exact: bool,
 ) -> RelativeMotions:
     """The motion and overlap of pairs of a part near the present poses, m = 1."""
+
+    def run(block: Array) -> RelativeMotions:
+        return _measured(scans, placement, least, block, exact=exact)
+
+    motions = in_blocks(run, pairs, (scans, placement))
+    return eqx.tree_at(lambda m: m.pairs, motions, pairs)
+
+
+@kept_program
+def _measured(
+    scans: PreparedScans,
+    placement: Placement,
+    least: Scalar,
+    pairs: Int[Array, "b 2"],
+    *,
+    exact: bool,
+) -> RelativeMotions:
     T_world_i = placement.T_world_i
     widths = widths_of(scans, placement, exact=exact)
     optimiser, zero = optimiser_of(T_world_i), jnp.zeros((), T_world_i.dtype)
 
     def measured(pair: Array) -> Motion:
         i, j = pair
-        problem = problem_of(scans, i, j, exact)
+        problem = scans.problem(i, j, exact=exact)
         T_i_j = lie.between(T_world_i[i], T_world_i[j])
         return lie.straightened(optimiser.repeat(problem, T_i_j, widths))
 
@@ -155,16 +166,3 @@ def widths_of(
     spacing = jnp.where(spacing > 0, spacing, 1)
     factors = _EXACT_WIDTHS if exact else _TABLE_WIDTHS
     return spacing * jnp.asarray(factors, spacing.dtype)
-
-
-def problem_of(
-    scans: PreparedScans, i: Array, j: Array, exact: bool = False
-) -> Problem:
-    """Scan j as the source, scan i as the target."""
-    source, target = scans.cloud(j), scans.cloud(i)
-    if not exact:
-        return Problem.of(source, target, scans.table(i))
-    if target.judged is None:  # whose index is that of the evidence
-        return Problem.of(source, target, jax.tree.map(lambda x: x[i], scans.exact))
-    kind = exact_index(target.points.shape[0])
-    return Problem.of(source, target, kind.build(target.points, target.mask))

@@ -5,9 +5,7 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.threads import map_in_threads
@@ -24,8 +22,8 @@ from jaxreg.multiview.follow_sequence import (
     descended,
     descended_in_input_frames,
 )
+from jaxreg.multiview.likely_overlap import LikelyOverlap, NearPairs
 from jaxreg.multiview.method import min_log_evidence, num_kept
-from jaxreg.multiview.near_pairs import likely_overlap
 from jaxreg.multiview.place import Placement, joins, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
@@ -50,6 +48,7 @@ class Rounds:
         on_pairs: told of every batch, or None.
         report: told of progress.
         workers: who registers pairs; None for threads of this process.
+        held: `(v,)` scans that stay where they are, or None.
     """
 
     def __init__(
@@ -62,6 +61,7 @@ class Rounds:
         on_pairs: OnPairs | None,
         report: Progress,
         workers: Workers | None = None,
+        held: np.ndarray | None = None,
     ) -> None:
         self.workers = workers
         self.method, self.averaging, self.scans = method, averaging, scans
@@ -71,7 +71,7 @@ class Rounds:
             self.known = known.with_modes(num_kept(method))
             ids = map(tuple, np.asarray(known.pairs).tolist())
             self.row = {pair: row for row, pair in enumerate(ids)}
-        self.tried = np.zeros((scans.num_scans,) * 2, bool)
+        self.overlaps = LikelyOverlap(scans, held)
         self.found: list[RelativeMotions] = []
         self.sure: dict[tuple[int, int], RelativeMotions] = {}
         self.rivals: dict[tuple[int, int], RelativeMotions] = {}
@@ -95,41 +95,40 @@ class Rounds:
             self._register(pairs)
             if self.num_tried >= self.most:
                 break
-            placement, trusted, likely = self._evidence()
+            placement, tried, trusted, near = self._evidence()
             part = np.asarray(placement.part)
-            pairs = next_pairs(self.tried, trusted, likely, part, rng)
+            ids, overlap = np.asarray(near.pairs), np.asarray(near.overlap)
+            pairs = next_pairs(tried, trusted, ids, overlap, part, rng)
             pairs = pairs[: self.most - self.num_tried]
             if order == "sequential":
-                self._close_loops(pairs, placement, trusted)
+                held = np.bincount(tried[trusted].ravel(), minlength=len(part)) >= SAFE
+                self._close_loops(pairs, placement, held)
         return RelativeMotions.joined(self.found)
 
     @property
     def num_tried(self) -> int:
         """Pairs registered or known."""
-        return int(np.triu(self.tried).sum())
+        return sum(len(x.overlap) for x in self.found)
 
     def _register(self, pairs: np.ndarray) -> None:
         """The pairs in batches of one compiled size, two batches at a time."""
-        self.tried[pairs[:, 0], pairs[:, 1]] = True
-        self.tried |= self.tried.T
+        total = self.num_tried + len(pairs)
         ids = list(map(tuple, pairs.tolist()))
         have = [self.row[pair] for pair in ids if pair in self.row]
         if self.known is not None and have:
-            self.found.append(self.known.rows(jax.device_put(np.array(have))))
+            self.found.append(self.known.on_host(have))
         self.found += [self.sure[pair] for pair in ids if pair in self.sure]
         pairs = pairs[[not self._is_known(pair) for pair in ids]]
-        total = self.num_tried
         done = total - len(pairs)
         self.report("registering pairs", done, total)
         found: dict[int, RelativeMotions] = {}
         for number, batch in self._searched(pairs):
             start = number * _PAIRS_PER_BATCH
-            rows = jnp.arange(min(_PAIRS_PER_BATCH, len(pairs) - start))
-            out = batch.rows(rows)
+            out = batch.on_host(slice(len(pairs) - start))
             rivals = [self.rivals.get(tuple(pair)) for pair in out.pairs.tolist()]
             found[number] = out.or_better(rivals)
             self._tell(found[number])
-            done += len(rows)
+            done += len(out.overlap)
             self.report("registering pairs", done, total)
         self.found += [found[number] for number in sorted(found)]
 
@@ -176,7 +175,7 @@ class Rounds:
         self.report("following the sequence", len(gaps), len(gaps))
 
     def _close_loops(
-        self, pairs: np.ndarray, placement: Placement, trusted: np.ndarray
+        self, pairs: np.ndarray, placement: Placement, held: np.ndarray
     ) -> None:
         """Pairs of a sequence by descents from the present poses.
 
@@ -184,7 +183,7 @@ class Rounds:
         descent is one try, where a search has hundreds: of scans that others hold it is
         believed as an answer is. Scans that hang by few pairs need the best there is.
         """
-        part, held = np.asarray(placement.part), np.sum(trusted, axis=1) >= SAFE
+        part = np.asarray(placement.part)
         likely = float(min_log_evidence(self.method))
         T = placement.T_world_i
         for done, (i, j) in enumerate(pairs.tolist()):
@@ -210,25 +209,13 @@ class Rounds:
             self.sure[i, j] = one.with_modes(num_kept(self.method))
         return True
 
-    def _evidence(self) -> tuple[Placement, np.ndarray, np.ndarray]:
-        """Present poses, and by them the trusted pairs and likely overlap."""
-        motions = RelativeMotions.joined(self.found).padded(self.most)
-        placement, likely = _prospects(self.method, self.averaging, self.scans, motions)
-        trusted = np.zeros_like(self.tried)
-        i, j = np.asarray(motions.pairs).T
-        trusted[i, j] = np.asarray(joins(placement.edge_weight)) & (i != j)
-        likely = np.asarray(likely)
-        return placement, trusted | trusted.T, likely + likely.T
-
-
-@kept_program
-def _prospects(
-    method: AbstractRegistrar,
-    averaging: AbstractAverager | None,
-    scans: PreparedScans,
-    motions: RelativeMotions,
-) -> tuple[Placement, Float[Array, "v v"]]:
-    """Present poses, and the share of scan j that is near scan i by them, i < j."""
-    least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
-    found = place(motions, scans.num_scans, averaging, least)
-    return found, likely_overlap(scans, found)
+    def _evidence(self) -> tuple[Placement, np.ndarray, np.ndarray, NearPairs]:
+        """Present poses, the pairs tried, those trusted, and those that may overlap."""
+        found = RelativeMotions.joined(self.found)
+        num = len(found.overlap)
+        least = jnp.asarray(min_log_evidence(self.method), self.scans.radius.dtype)
+        motions, num_scans = found.padded(self.most), self.scans.num_scans
+        placement = place(motions, num_scans, self.averaging, least)
+        trusted = np.asarray(joins(placement.edge_weight))[:num]
+        near = self.overlaps.of(placement, seed=num)
+        return placement, np.asarray(found.pairs), trusted, near

@@ -1,5 +1,7 @@
 """Relative motions between pairs of scans: batches of the pairwise search."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
-from jaxreg._core.typing import Key
+from jaxreg._core.typing import ArrayLike, Key
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.method import num_kept, solve
 from jaxreg.multiview.prepare import PreparedScans
@@ -63,20 +65,20 @@ class RelativeMotions(BriefModule):
         parts = self.T_i_j, self.overlap, self.log_evidence, self.inlier_rmse
         return RelativeMotions(self.pairs, *(x[e, mode][:, None] for x in parts))
 
-    @kept_program
-    def rows(self, rows: Int[Array, " r"]) -> "RelativeMotions":
-        """Some of them."""
-        return jax.tree.map(lambda x: x[rows], self)
+    def on_host(self, rows: Any = slice(None)) -> "RelativeMotions":
+        """Some of them, of NumPy arrays."""
+        return jax.tree.map(lambda x: np.asarray(x)[rows], self)
 
     def or_better(self, others: list["RelativeMotions | None"]) -> "RelativeMotions":
-        """Where there is a likelier motion of a pair, that one."""
-        out = self
+        """Where there is a likelier motion of a pair, that one; of NumPy arrays."""
+        out = jax.tree.map(np.array, self)
         for k, other in enumerate(others):
-            own = float(self.log_evidence[k, 0])
+            own = float(out.log_evidence[k, 0])
             if other is None or float(other.log_evidence[0, 0]) <= own:
                 continue
-            other = other.with_modes(self.num_modes)
-            out = jax.tree.map(lambda x, y, k=k: x.at[k].set(y[0]), out, other)
+            one = other.with_modes(self.num_modes).on_host()
+            for x, y in zip(jax.tree.leaves(out), jax.tree.leaves(one), strict=True):
+                x[k] = y[0]
         return out
 
     def with_modes(self, num: int) -> "RelativeMotions":
@@ -99,7 +101,8 @@ class RelativeMotions(BriefModule):
         """With pairs of scan 0 and itself that do not overlap, to so many."""
         more = num - len(self.overlap)
 
-        def pad(x: Array) -> Array:
+        def pad(x: ArrayLike) -> Array:
+            x = jnp.asarray(x)
             return jnp.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1))
 
         real = jnp.arange(num)[:, None] < len(self.overlap)
@@ -109,13 +112,9 @@ class RelativeMotions(BriefModule):
 
     @staticmethod
     def joined(some: list["RelativeMotions"]) -> "RelativeMotions":
-        """All of them, in ascending order of the scans."""
-        if isinstance(some[0].T_i_j, np.ndarray):  # float64, which JAX may not have
-            every = jax.tree.map(lambda *x: np.concatenate(x), *some)
-            order = np.lexsort((every.pairs[:, 1], every.pairs[:, 0]))
-            return jax.tree.map(lambda x: x[order], every)
-        every = jax.tree.map(lambda *x: jnp.concatenate(x), *some)
-        return every.rows(jnp.lexsort((every.pairs[:, 1], every.pairs[:, 0])))
+        """All of them, in ascending order of the scans; of NumPy arrays."""
+        every = jax.tree.map(lambda *x: np.concatenate(list(map(np.asarray, x))), *some)
+        return every.on_host(np.lexsort((every.pairs[:, 1], every.pairs[:, 0])))
 
     def in_input_frames(self, scans: PreparedScans) -> "RelativeMotions":
         """From the scans' centred frames and unit."""
@@ -182,7 +181,7 @@ def relative_motions(
         solution = solve(
             scans.method_of(method, i, j),
             (scans.cloud(j), scans.cloud(i)),
-            scans.table(i),
+            scans.table(method, i),
             jax.random.fold_in(jax.random.fold_in(key, i), j),
         )
         modes = jax.tree.map(lambda x: x[: num_kept(method)], solution.modes)
