@@ -41,6 +41,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
 from jaxreg._core.arrays import on_both
+from jaxreg._core.shares import shared
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import PointCloud, levelled
 from jaxreg.geometry import lie
@@ -179,7 +180,7 @@ class Witness(eqx.Module):
                     pose[1], lambda T: _one_way(problem, T, *rest), _nothing, pose[0]
                 )
 
-            return lax.map(one, (T, used))
+            return shared(lambda poses: lax.map(one, poses), (T, used))
 
         return _of_both(*on_both(ways, forward, backward), used)
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.shares import shared
 from jaxreg._core.typing import Scalar
 from jaxreg.local import LocalOptimiser, decoupled_error
 from jaxreg.matching import Problem, match
@@ -56,7 +57,7 @@ def measure(
 
     def block(b: Array, out: tuple[Array, ...]) -> tuple[Array, ...]:
         rows = first_row + b * batch_size + jnp.arange(batch_size)
-        found = jax.vmap(one)(T_predicted[rows])
+        found = shared(jax.vmap(one), T_predicted[rows])
         return jax.tree.map(lambda all_, new: all_.at[rows].set(new), out, found)
 
     start = (T_predicted, particles.motion_error, particles.energy)

@@ -9,6 +9,7 @@ from jaxtyping import Array
 from jaxreg._core import control
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts
+from jaxreg._core.shares import shared
 from jaxreg._core.typing import Key, Motion
 from jaxreg.local import AbstractStep, GaussNewton, decoupled_error
 from jaxreg.matching import LIKELY, AbstractResidual, PointToPlane, Problem, match
@@ -104,7 +105,7 @@ class MultiStart(AbstractSearch):
 
         batch = min(self.batch_size, self.num_starts)
         blocks = T.reshape(-1, batch, *T.shape[1:])
-        ends = lax.map(jax.vmap(one), blocks)
+        ends = lax.map(lambda T: shared(jax.vmap(one), T), blocks)
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), ends)
         found = jax.tree.map(lambda x: x[: self.num_starts], flat)
         particles = eqx.tree_at(

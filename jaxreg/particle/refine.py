@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
 from jaxreg._core.arrays import cast_floats
+from jaxreg._core.shares import shared
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.geometry import lie
 from jaxreg.local import Curvature, GaussNewton, LocalOptimiser, Rest, at_rest
@@ -110,4 +111,4 @@ def _of_used(
         zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         return control.cond(used, function, lambda _: zero, T)
 
-    return lax.map(one, (T, used))
+    return shared(lambda modes: lax.map(one, modes), (T, used))

@@ -22,7 +22,13 @@ from jaxreg._core.checks import (
 from jaxreg._core.log import log_solution
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import ArrayLike, Key, Progress
-from jaxreg.batching.devices import chosen_devices
+from jaxreg.batching.devices import (
+    Devices,
+    chosen_devices,
+    for_one,
+    map_rows,
+    spread_rows,
+)
 from jaxreg.batching.padding import (
     check_lists,
     is_list_of_clouds,
@@ -30,7 +36,7 @@ from jaxreg.batching.padding import (
     rounded_up,
 )
 from jaxreg.local import ICP
-from jaxreg.particle import ParticleFilter
+from jaxreg.particle import AbstractSearch, ParticleFilter
 from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
 from jaxreg.registration.far import (
     check_prior_fits,
@@ -121,10 +127,12 @@ def register(
             that is quickest, and a million points at a time on an accelerator.
         progress: called as `progress(stage, done, total)` as some of many pairs are
             done, on an accelerator all of a size; not for one pair, not under `jit`.
-        mesh: a mesh of devices with an axis "pair", over which many pairs are spread;
-            without one they stay where the batch is, by the sharding of its leading
-            axis, or are spread over the mesh around the call (`jax.set_mesh`) if that
-            has an axis "pair". Under `jit` with automatic axes name it.
+        mesh: a mesh of devices with an axis "pair", over which many pairs are spread,
+            with an axis "particle", over which the particles of each pair are, or with
+            both; only a search, such as `ParticleFilter`, has particles. Without a mesh
+            pairs stay where the batch is, by the sharding of its leading axis, or are
+            spread over the mesh around the call (`jax.set_mesh`) if that has such an
+            axis. Under `jit` with automatic axes name it.
 
     Returns:
         A `RegistrationSolution`, with leading axes for a batch; for lists a list of
@@ -152,12 +160,20 @@ def register(
         compiles once.
 
     Devices:
-        Each registers its own pairs and hears of no other. Bits are the same on any
-        number of devices that get several pairs each; on one device, and with one pair
-        each, XLA rounds some sums otherwise. A number of pairs that is no multiple of
-        the devices is filled up, which costs a copy. `register` also works inside
-        `jax.shard_map`; with its checks (`check_vma`) both branches of a condition are
-        computed.
+        Along "pair" each registers its own pairs and hears of no other. Bits are the
+        same on any number of devices that get several pairs each; on one device, and
+        with one pair each, XLA rounds some sums otherwise. A number of pairs that is no
+        multiple of the devices is filled up, which costs a copy. `register` also works
+        inside `jax.shard_map`, where it spreads nothing further; with its checks
+        (`check_vma`) both branches of a condition are computed.
+
+        Along "particle" all hold the pair: each measures its share of every block of
+        `batch_size` particles, refines and judges its share of the modes, and gathers
+        those of the others; random numbers, resampling and choices all compute alike.
+        So the answer does not depend on the number of devices, but for rounding, as
+        above. Shares that do not come out even are filled up. Not shared are the
+        preparation of clouds and indexes, poses of local features and the last digits
+        of the best pose.
 
     Memory:
         Groups of `batch_size` pairs are registered one after another on each core. On a
@@ -173,7 +189,8 @@ def register(
         check_count(batch_size, "batch_size")
     check_callable(progress, "progress")
     key = None if key is None else check_key(key)
-    devices = chosen_devices(mesh, source)
+    particles = isinstance(method, AbstractSearch)
+    devices = chosen_devices(mesh, source, particles=particles)
     how = batch_size, progress, devices
     masks = source_mask, target_mask
     scaled = isinstance(method, ICP) and method.with_scale
@@ -193,7 +210,9 @@ def register(
     if batch:
         sol = register_batch(method, batch, pair, init, key, *how)
     else:
-        sol = _register_one(method, _rounded_up(pair), init, key)
+        alone = for_one(devices)
+        given = spread_rows(alone, (_rounded_up(pair), init, key))
+        sol = _register_one(method, given, alone)
     sol = moved_back(sol, here, there)
     log_solution("register", sol)
     return sol
@@ -224,11 +243,14 @@ def _rounded_up(pair: tuple[Array, ...]) -> tuple[Array, ...]:
     return tuple(lengthened(x, rounded_up(len(x))) for x in pair)
 
 
+# A source, a target and masks of both; an initial pose; a key.
+_Given = tuple[tuple[Array, ...], Array | None, Array | None]
+
+
 @kept_program
 def _register_one(
-    method: AbstractRegistrar,
-    pair: tuple[Array, ...],
-    init: Array | None,
-    key: Array | None,
+    method: AbstractRegistrar, given: _Given, devices: Devices | None
 ) -> RegistrationSolution:
-    return register_pair(method, pair, init, key)
+    if devices is None:
+        return register_pair(method, *given)
+    return map_rows(devices, lambda given: register_pair(method, *given), given)
