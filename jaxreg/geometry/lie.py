@@ -123,8 +123,8 @@ def log_jacobian(tangent: Float[Array, "*b k"]) -> Float[Array, "*b k k"]:
     slope = h / 2 - (half / jnp.sin(half)) ** 2 / 2
     a = jnp.where(wide, (slope - 2 * (h - 1)) / safe, 1 / 12 - sq**2 / 30240)
     b = jnp.where(wide, (slope - h + 1) / safe**2, -1 / 720 - sq / 15120)
-    ad2 = jnp.einsum("...ab,...bc->...ac", ad, ad)
-    ad4 = jnp.einsum("...ab,...bc->...ac", ad2, ad2)
+    ad2 = product(ad, ad)
+    ad4 = product(ad2, ad2)
     eye = jnp.broadcast_to(jnp.eye(k, dtype=ad.dtype), ad.shape)
     return eye + ad / 2 + a * ad2 + b * ad4
 
@@ -181,7 +181,7 @@ def adjoint(T: Motions) -> Float[Array, "*b k k"]:
         turn = jnp.ones_like(shift[..., :1, :])
     else:
         # A product of matrices may be run in reduced precision on accelerators.
-        shift = jnp.sum(hat(t)[..., None] * R[..., None, :, :], axis=-2)
+        shift = product(hat(t), R)
         turn = R
     low = jnp.zeros((*turn.shape[:-1], R.shape[-1]), T.dtype)
     top = jnp.concatenate([R, shift], axis=-1)
@@ -214,7 +214,7 @@ def translation(T: Motions) -> Float[Array, "*b d"]:
 def inverse(T: Motions) -> Motions:
     """The inverse motion, by transposition."""
     R_inv = jnp.swapaxes(rotation(T), -1, -2)
-    return compose(R_inv, -jnp.sum(R_inv * translation(T)[..., None, :], axis=-1))
+    return compose(R_inv, -product(R_inv, translation(T)[..., None])[..., 0])
 
 
 def between(

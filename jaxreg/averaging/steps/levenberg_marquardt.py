@@ -34,7 +34,7 @@ from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.multigrid import Multigrid, multigrid
-from jaxreg.linear.operator import GraphLaplacian, divergence, matmul
+from jaxreg.linear.operator import GraphLaplacian, divergence
 from jaxreg.linear.small import product
 from jaxreg.linear.solvers import MultigridCG
 from jaxreg.robust import AbstractKernel
@@ -70,7 +70,7 @@ class Problem(NamedTuple):
     def _weighted(self, J: Array) -> Array:
         if self.precision.ndim == 2:
             return self.precision[..., None] * J
-        return matmul(self.precision, J)
+        return product(self.precision, J)
 
     def cost(self, T: Array) -> Array:
         """The objective."""
@@ -81,14 +81,14 @@ class Problem(NamedTuple):
         predicted = self.graph.predicted(T)
         r = self.error.value(predicted, self.graph.T_i_j)
         # A left tangent of both ends turns the predicted motion from the right.
-        J = matmul(
+        J = product(
             self.error.jacobian(predicted, r),
             lie.adjoint(lie.inverse(T))[self.graph.edges[:, 1]],
         )
         WJ = self._weighted(J)
         force = jnp.sum(WJ * r[:, :, None], axis=-2)
         trust = self.trust(jnp.sum(r * self._weighted(r[..., None])[..., 0], axis=-1))
-        Q = matmul(jnp.swapaxes(J, -1, -2), trust[:, None, None] * WJ)
+        Q = product(jnp.swapaxes(J, -1, -2), trust[:, None, None] * WJ)
         return Q, trust[:, None] * force
 
 
@@ -123,7 +123,7 @@ class Minimum(NamedTuple):
     T: Float[Array, "v D D"]
     converged: Bool[Array, ""]
     step: Int[Array, ""]
-    cycle: "Cycle"
+    cycle: "Cycle | None"
     trace: AveragingTrace | None
 
 
