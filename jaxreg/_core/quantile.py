@@ -11,7 +11,7 @@ bits lose.
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
 
@@ -32,7 +32,24 @@ def masked_quantile(
 
     Gradients: of that value alone, at the row where it was found.
     """
-    return _one_of(x, mask, _value_of(lax.stop_gradient(x), mask, share))
+    count = jnp.sum(mask, dtype=jnp.int32)
+    total = count.astype(x.dtype)
+    wanted = jnp.asarray(share, x.dtype) * total * (1 - 4 * jnp.finfo(x.dtype).eps)
+    rank = jnp.clip(jnp.ceil(wanted), 1, jnp.maximum(total, 1)).astype(jnp.int32)
+    return _one_of(x, mask, _value_of(lax.stop_gradient(x), mask, rank))
+
+
+def nearest_rank(
+    x: Float[Array, " n"], mask: Bool[Array, " n"], q: float | Array
+) -> Float[Array, ""]:
+    """The value at quantile q of the valid ones (nearest rank): as `masked_quantile`.
+
+    Ranks are counted from the least value, at 0, to the greatest, at 1.
+    """
+    count = jnp.sum(mask, dtype=jnp.int32)
+    rank = jnp.floor(q * (count - 1).astype(x.dtype) + 0.5).astype(jnp.int32)
+    rank = jnp.maximum(rank, 0) + 1
+    return _one_of(x, mask, _value_of(lax.stop_gradient(x), mask, rank))
 
 
 @jax.custom_jvp
@@ -50,17 +67,13 @@ def _one_of_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _value_of(
-    x: Float[Array, " n"], mask: Bool[Array, " n"], share: Float[Array, ""] | float
+    x: Float[Array, " n"], mask: Bool[Array, " n"], rank: Int[Array, ""]
 ) -> Float[Array, ""]:
-    """Bit by bit."""
+    """The valid value of a rank, counted from 1: bit by bit."""
     kind, bits = (jnp.int32, 31) if x.dtype == jnp.float32 else (jnp.int64, 63)
     # abs: the sign bit of -0.0 would make it the least integer.
     keys = lax.bitcast_convert_type(jnp.abs(x), kind)
     keys = jnp.where(mask, keys, jnp.iinfo(kind).max)
-    count = jnp.sum(mask, dtype=jnp.int32)
-    total = count.astype(x.dtype)
-    wanted = jnp.asarray(share, x.dtype) * total * (1 - 4 * jnp.finfo(x.dtype).eps)
-    rank = jnp.clip(jnp.ceil(wanted), 1, jnp.maximum(total, 1)).astype(jnp.int32)
 
     def set_bit(k: Array, found: Array) -> Array:
         # The greatest key with fewer than `rank` values below it is the answer.
@@ -69,14 +82,4 @@ def _value_of(
         return jnp.where(below < rank, trial, found)
 
     found = control.fori_loop(0, bits, set_bit, jnp.zeros((), kind))
-    return jnp.where(count > 0, lax.bitcast_convert_type(found, x.dtype), 0)
-
-
-def nearest_rank(
-    x: Float[Array, " e"], mask: Bool[Array, " e"], q: float | Array
-) -> Float[Array, ""]:
-    """The value of `x[mask]` at quantile q (nearest rank); 0 if the mask is empty."""
-    count = jnp.sum(mask)
-    rank = jnp.floor(q * (count - 1).astype(x.dtype) + 0.5).astype(jnp.int32)
-    value = jnp.sort(jnp.where(mask, x, jnp.inf))[jnp.maximum(rank, 0)]
-    return jnp.where(count > 0, value, 0)
+    return jnp.where(jnp.any(mask), lax.bitcast_convert_type(found, x.dtype), 0)
