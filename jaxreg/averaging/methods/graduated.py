@@ -237,8 +237,13 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         return spare_factor(self.graph, count)
 
 
+def _without_cycle(state: _State) -> _State:
+    """Multigrid cycles are as large as the graph, and each attempt builds its own."""
+    return state._replace(found=state.found._replace(cycle=None))
+
+
 class _Best(NamedTuple):
-    end: _State
+    end: _State  # without its cycle
     score: Array
     num_steps: Int[Array, ""]  # starts that were tried
     settled: Bool[Array, ""]
@@ -253,7 +258,7 @@ class _Attempts(AbstractIteration[Array, _Best]):
     def init(self, start: Array) -> _Best:
         no = jnp.asarray(False)
         return _Best(
-            end=self.narrowing.init((start, no)),
+            end=_without_cycle(self.narrowing.init((start, no))),
             score=-jnp.full((), jnp.inf, start.dtype),
             num_steps=jnp.asarray(0, jnp.int32),
             settled=no,
@@ -272,6 +277,7 @@ class _Attempts(AbstractIteration[Array, _Best]):
         T_start = jnp.where(every, b.end.found.T, self.starts[b.num_steps])
         begin = narrowing.init((T_start, every))
         end = iterate(narrowing, begin, max_steps=narrowing.most).state
+        end = _without_cycle(end)
         score = explained(graph, end.found.T).log_ratio
         steps = b.end.found.step + end.found.step
         better = score > b.score
