@@ -14,6 +14,8 @@ from jaxreg.io import read_log
 
 #: Poses and edges of small graphs, poses of a ring of large ones.
 N, H, RING = 32, 465, 100
+#: Steps of a street of large chains, and frames in a row that see a place again.
+STREET, SEEN = 10, 5
 
 
 def motions(R: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -90,6 +92,68 @@ def large_graph(
     second = (first + rng.integers(1, num, len(first))) % num
     edges[wrong] = np.stack([first, second], axis=1)
     return X, edges, T, wrong
+
+
+def large_chain(
+    num: int, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of a drive through streets, with 1 % closures: the same as `large_graph`.
+
+    Streets of `STREET` steps between crossings, each passed about ten times. Where one
+    is passed again, `SEEN` frames in a row may close a loop; a tenth of the closures is
+    wrong.
+    """
+    rng = np.random.default_rng(seed)
+    X, streets, forward = _drive(num, rng)
+    # An earlier pass of the same street, if there is one.
+    order = np.argsort(streets, kind="stable")
+    again = np.flatnonzero(streets[order][1:] == streets[order][:-1])
+    again = rng.choice(again, min(len(again), num // 100 // SEEN), replace=False)
+    before, now = order[again], order[again + 1]
+    within = np.arange(2, 2 + SEEN)
+    turned = forward[before] != forward[now]
+    there = np.where(turned[:, None], STREET - within, within)
+    first = (STREET * before[:, None] + there).ravel()
+    second = (STREET * now[:, None] + within).ravel()
+    step = np.arange(num)
+    edges = np.concatenate(
+        [np.stack([step[:-1], step[1:]], 1), np.stack([first, second], 1)]
+    )
+    # Odometry: a tenth of the noise of the grid.
+    error = motions(
+        small_rotations(rng, len(edges), 0.1), 0.002 * rng.normal(size=(len(edges), 3))
+    )
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ error
+    wrong = np.zeros(len(edges), bool)
+    wrong[num - 1 + rng.choice(len(first), len(first) // 10, replace=False)] = True
+    edges[wrong, 0] = rng.integers(0, num // 2, int(wrong.sum()))
+    edges[wrong, 1] = rng.integers(num // 2, num, int(wrong.sum()))
+    return X, edges, T, wrong
+
+
+def _drive(
+    num: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses, and the street and its direction of each `STREET` of them."""
+    blocks = -(-num // STREET)
+    side = max(2, round((blocks / 20) ** 0.5))
+    heading, at = np.zeros(blocks, int), np.zeros((blocks, 2), int)
+    ways = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    turns = rng.integers(-1, 2, blocks)  # right, straight on or left
+    place, way = np.zeros(2, int), 0
+    for k in range(blocks):
+        way = (way + turns[k]) % 4
+        while not np.all((0 <= place + ways[way]) & (place + ways[way] <= side)):
+            way = (way + 1) % 4
+        heading[k], at[k] = way, place
+        place = place + ways[way]
+    forward = heading < 2
+    low = np.where(forward[:, None], at, at + ways[heading])
+    streets = (low[:, 0] * (side + 1) + low[:, 1]) * 2 + heading % 2
+    block, step = np.divmod(np.arange(num), STREET)
+    t = STREET * at[block] + step[:, None] * ways[heading[block]]
+    R = Rotation.from_euler("z", np.pi / 2 * heading[block][:, None]).as_matrix()
+    return motions(R, np.pad(t, ((0, 0), (0, 1))).astype(float)), streets, forward
 
 
 def on_group(T: np.ndarray) -> np.ndarray:
