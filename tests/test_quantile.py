@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from jaxreg._core.quantile import masked_quantile
+from jaxreg._core.quantile import masked_quantile, nearest_rank
 
 
 N = 23
@@ -80,3 +80,13 @@ def test_its_gradient_is_that_of_the_value_that_it_is():
     np.testing.assert_array_equal(slope, [4, 0, 12])
     nothing = jax.grad(lambda x: masked_quantile(x, x > 9, 0.5))(x)
     np.testing.assert_array_equal(nothing, 0)
+
+
+@pytest.mark.parametrize("q", [0.0, 0.25, 0.5, 0.98, 1.0])
+def test_nearest_ranks_run_from_the_least_value_to_the_greatest(q):
+    x = np.random.default_rng(0).permutation(N).astype(np.float32)
+    for count in (0, 1, 2, 7, N):
+        mask = np.arange(N) < count
+        valid = np.sort(x[:count])
+        wanted = valid[math.floor(q * (count - 1) + 0.5)] if count else 0
+        assert nearest_rank(jnp.asarray(x), jnp.asarray(mask), q) == wanted
