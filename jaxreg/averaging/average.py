@@ -9,6 +9,7 @@ from jaxreg._core.checks import check_callable, check_count, check_key, check_me
 from jaxreg._core.log import log_solution
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
+from jaxreg.averaging.growing import average_grown, check_previous
 from jaxreg.averaging.many import average_batch, average_list, average_one, check_init
 from jaxreg.averaging.methods.correntropy import Correntropy
 from jaxreg.averaging.world.arguments import check_known
@@ -31,6 +32,7 @@ def average(
     fixed: Sequence[tuple[Any, ...]] | None = None,
     control: Sequence[tuple[Any, ...]] | None = None,
     levels: Sequence[tuple[Any, ...]] | None = None,
+    previous: AveragingSolution | None = None,
 ) -> AveragingSolution: ...
 
 
@@ -48,6 +50,7 @@ def average(
     fixed: Sequence[tuple[Any, ...]] | None = None,
     control: Sequence[tuple[Any, ...]] | None = None,
     levels: Sequence[tuple[Any, ...]] | None = None,
+    previous: AveragingSolution | None = None,
 ) -> list[AveragingSolution]: ...
 
 
@@ -64,6 +67,7 @@ def average(
     fixed: Sequence[tuple[Any, ...]] | None = None,
     control: Sequence[tuple[Any, ...]] | None = None,
     levels: Sequence[tuple[Any, ...]] | None = None,
+    previous: AveragingSolution | None = None,
 ) -> AveragingSolution | list[AveragingSolution]:
     """Finds poses that agree with relative motions: `T_i_j = inv(T_world_i) T_world_j`.
 
@@ -116,6 +120,17 @@ def average(
             last axis of the world, each of its two angles with that deviation, in
             radians. 3D alone; they are adjusted to as priors are, and hold neither
             place nor heading.
+        previous: a solution of the graph before it grew: of its first frames and its
+            first edges, all of them before the new ones, without what is known of
+            poses. The answer is in its frame and, by `Correntropy`, takes the time of
+            what is new: new frames, ends of new edges and what is near them move
+            under the kernel of before, and where that moves more, more of them. Where
+            a new edge contradicts the poses all is averaged anew, as only the whole
+            tells which is wrong: a loop that closes far off costs that, as does a wrong
+            one, once. So does a `previous` that did not converge, more than 1,024 new
+            frames, or more than there were. Other methods, and graphs of up to
+            `DENSE_LIMIT` frames, are averaged whole, from the poses of before. Not
+            under `jit`, `vmap` and `grad`.
 
     Returns:
         An `AveragingSolution`, with leading axes for a batch; for a list a list of
@@ -133,13 +148,15 @@ def average(
 
     Raises:
         TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,
-            `method` no averaging method, or `key` no key.
+            `method` no averaging method, `key` no key, or `previous` no solution.
         ValueError: if `init` has another shape than the poses or is no rigid motion
             within 1e-2, a batch has several leading axes, the graphs of a list differ
             in dimension or in whether they have information, or the mesh has no axis
             "pair"; or if a row of `priors`, `fixed`, `control` or `levels`, which is
             named, does not fit the graph, has a singular information, or fixes a frame
-            twice.
+            twice; if `previous` is traced, has more frames or edges than the graph or
+            another dimension or dtype, or is given beside `init`, `priors`, `fixed`,
+            `control` or `levels`, or with many graphs.
 
     Positions in the world may be map coordinates: in NumPy arrays of float64 they are
     taken from the first before they are rounded to the dtype of the graph, and where
@@ -159,7 +176,8 @@ def average(
         check_count(batch_size, "batch_size")
     check_callable(progress, "progress")
     key = None if key is None else check_key(key)
-    told = any(x is not None for x in (priors, fixed, control, levels))
+    beside = {"priors": priors, "fixed": fixed, "control": control, "levels": levels}
+    told = any(x is not None for x in beside.values())
     many = isinstance(graph, list | tuple) or (
         isinstance(graph, PoseGraph) and graph.edges.ndim == 3
     )
@@ -167,6 +185,11 @@ def average(
         raise ValueError(
             "priors, fixed, control, levels: of one graph, found many graphs."
         )
+    if previous is not None:
+        one = check_previous(previous, graph, {"init": init, **beside})
+        solution = average_grown(one, method, previous, key)
+        log_solution("average", solution)
+        return solution
     if isinstance(graph, list | tuple):
         how = batch_size, progress, chosen_devices(mesh)
         return average_list(graph, method, init, key, *how)

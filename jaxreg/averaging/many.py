@@ -51,13 +51,24 @@ def average_one(
     key: Key | None,
 ) -> AveragingSolution:
     """`average_graph`; small graphs of similar sizes share its programs."""
+    if graph.num_poses > DENSE_LIMIT:
+        return average_graph(graph, method, init, key)
+    return average_rounded(graph, method, init, key)
+
+
+def average_rounded(
+    graph: PoseGraph,
+    method: AbstractAverager,
+    init: Float[Array, "v D D"] | None,
+    key: Key | None,
+) -> AveragingSolution:
+    """`average_graph`, by a program that graphs of similar sizes share."""
     arrays = jax.tree.leaves((graph, init, key))
     own = (graph.num_poses, graph.num_edges)
     num_poses, num_edges = (
         rounded_up(n, k * _LEAST, 2) for n, k in zip(own, (1, 2), strict=True)
     )
-    apart = graph.num_poses > DENSE_LIMIT or (num_poses, num_edges) == own
-    if apart or not all(map(_is_held, arrays)):
+    if (num_poses, num_edges) == own or not all(map(_is_held, arrays)):
         return average_graph(graph, method, init, key)
     padded = dataclasses.replace(graph, num_poses=num_poses)
     padded = jax.tree.map(lambda x: lengthened(x, num_edges), padded)

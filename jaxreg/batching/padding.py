@@ -118,7 +118,7 @@ def stacked(arrays: Sequence[Array], num_rows: int) -> Array:
     return out
 
 
-def lengthened(x: Array, num_rows: int) -> Array:
+def lengthened(x: Array | np.ndarray, num_rows: int) -> Array:
     """A concrete array with rows of zero, or False, behind its own."""
     out = np.zeros((num_rows, *x.shape[1:]), x.dtype)
     out[: len(x)] = x

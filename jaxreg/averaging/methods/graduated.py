@@ -11,10 +11,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.quantile import nearest_rank
+from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.likelihood import (
     SETTLED,
     agreed_share,
@@ -77,11 +79,11 @@ def graduated(
     attempts = _Attempts(_Narrowing(fixed, counted, max_steps), starts)
     begin = attempts.init(starts[0])
     end = iterate(attempts, begin, max_steps=len(starts) + 1).state.end
-    trust_of = eqx.Partial(_trust, end.parts, end.width)
+    trust_of = eqx.Partial(kernel_trust, end.parts, end.width)
     result = Iterated(
         end.found.T,
         trust_of(fixed, end.found.T),
-        _DEVIATIONS * end.parts,
+        reported_width(end.parts),
         end.found.converged,
         end.found.step,
         AveragingTrace.of(end.rows, end.num_steps),
@@ -89,7 +91,24 @@ def graduated(
     return gauss_newton_gradients(graph, result, trust_of)
 
 
-def _trust(
+def reported_width(parts: Float[Array, "2"]) -> Float[Array, "2"]:
+    """That of a solution, from the deviations of a translation and a rotation."""
+    return _DEVIATIONS * parts
+
+
+def last_kernel(found: AveragingSolution) -> tuple[np.ndarray, np.ndarray]:
+    """The deviations of both parts, and the width over them, that a solution ended by.
+
+    Args:
+        found: of `Correntropy` on a graph of more than `DENSE_LIMIT` frames, concrete.
+    """
+    assert found.trace is not None
+    parts = np.asarray(found.kernel_width) / _DEVIATIONS
+    last = np.asarray(found.trace.kernel_width)[int(found.trace.num_rows) - 1]
+    return parts, np.asarray(last[1] / parts[1])
+
+
+def kernel_trust(
     parts: Array, width: Array, graph: PoseGraph, T: Array, _: object = None
 ) -> Float[Array, " e"]:
     """Of each edge under a kernel."""
