@@ -10,7 +10,7 @@ import numpy as np
 from bench.case import Case, Judged, Method, Options
 from bench.peers.pose_graphs import Found, large_lm, robust
 from bench.records import Metric, error
-from bench.workloads.averaging_data import large_graph
+from bench.workloads.averaging_data import large_chain, large_graph
 from bench.workloads.false_closures import odometry
 from bench.workloads.local_pairs import written_out
 from jaxreg.averaging import AbstractAverager, Correntropy, PoseGraphLM, average
@@ -19,7 +19,13 @@ from jaxreg.metrics import rotation_errors, translation_errors
 
 
 #: Poses, by the share of the edges that are wrong.
-SIZES = {0.0: (1_000, 3_000, 10_000), 0.1: (1_000, 3_000, 10_000, 100_000)}
+SIZES = {
+    0.0: (1_000, 3_000, 10_000),
+    0.1: (1_000, 3_000, 10_000, 100_000, 1_000_000),
+}
+CHAINS = (100_000, 1_000_000)
+#: Poses from which on a graph is float32: of a million it takes twice the memory else.
+_SINGLE = 1_000_000
 #: Wrong closures fill the factors of GTSAM's elimination: a call of LM takes 3 s at
 #: 1,000 poses, 68 s and 1 GB at 3,000; one of GNC 40 s at 1,000.
 LARGEST_LM, LARGEST_GNC = {0.0: 10_000, 0.1: 3_000}, {0.0: 0, 0.1: 1_000}
@@ -31,14 +37,43 @@ def cases(options: Options) -> Iterator[Case]:
     for outliers, nums in sizes.items():
         for num in nums:
             yield _case(num, outliers, quick=options.quick)
+    for num in () if options.quick else CHAINS:
+        yield _chain_case(num)
+
+
+def _chain_case(num: int) -> Case:
+    X, edges, T, wrong = large_chain(num, seed=0)
+    graph = _graph(num, edges, T, degrees=0.1, shift=0.002)
+    method = Correntropy()
+    own = partial(_own, method, graph)
+    text = written_out(method)
+    return Case(
+        name=f"a chain of {num} poses, 1% closures, a tenth of them wrong",
+        data=f"generated graph, {len(edges)} edges",
+        methods=[Method("jaxreg default", "jaxreg", text, own, on_accelerator=True)],
+        trials=[()],
+        judge=partial(judge, X, wrong),
+        repeats=3,
+        long=True,
+        x=num,
+        x_label="poses of a chain, 1% closures, a tenth of them wrong",
+    )
+
+
+def _graph(
+    num: int, edges: np.ndarray, T: np.ndarray, *, degrees: float, shift: float
+) -> PoseGraph:
+    """With the information of noise of these deviations."""
+    T = T.astype(np.float32) if num >= _SINGLE else T
+    each = np.repeat([shift**-2, np.deg2rad(degrees) ** -2], 3)
+    information = np.broadcast_to(np.diag(each).astype(T.dtype), (len(edges), 6, 6))
+    return PoseGraph.from_edges(edges, T, num, None, information)
 
 
 def _case(num: int, outliers: float, *, quick: bool) -> Case:
     X, edges, T, wrong = large_graph(num, outliers, seed=0)
     d = np.deg2rad(1.0)
-    information = np.diag(np.repeat([1 / 0.02**2, 1 / d**2], 3))
-    information = np.broadcast_to(information, (len(edges), 6, 6))
-    graph = PoseGraph.from_edges(edges, T, num, None, information)
+    graph = _graph(num, edges, T, degrees=1.0, shift=0.02)
     own: dict[str, AbstractAverager] = {}
     if not quick:
         own["jaxreg default"] = Correntropy()
@@ -57,6 +92,7 @@ def _case(num: int, outliers: float, *, quick: bool) -> Case:
         methods.append(Method("GTSAM LM", "gtsam", text, prepare=solver))
     if num <= LARGEST_GNC[outliers]:
         text = "from the path, the true deviations; the path is right"
+        information = np.asarray(graph.information)
         solve = partial(_gnc, edges, T, num, information, odometry(graph))
         methods.append(Method("GTSAM GNC", "gtsam", text, solve))
     # Of those that take a minute.
