@@ -92,7 +92,7 @@ def average_grown(
         if not isinstance(method, Correntropy) or graph.num_poses <= DENSE_LIMIT:
             return average_rounded(graph, method, jax.device_put(start), key)
         if len(previous.T_world_i) > DENSE_LIMIT:
-            found = _grown(graph, method, previous, start)
+            found = _grown(graph, previous, start)
             if found is not None:
                 return found
     found = average_rounded(graph, method, None, key)
@@ -103,25 +103,25 @@ def average_grown(
 
 
 def _grown(
-    graph: PoseGraph, method: Correntropy, previous: AveragingSolution, T: np.ndarray
+    graph: PoseGraph, previous: AveragingSolution, T: np.ndarray
 ) -> AveragingSolution | None:
     """From poses of all frames; None where edges contradict them."""
     part = Part.of(graph, previous)
-    active = part.touched()
-    while 2 * np.count_nonzero(active) <= graph.num_poses:
+    active, still = part.touched(), False
+    while not still:
+        # Of more than half, the next try would be the whole.
+        whole = 2 * np.count_nonzero(active) > graph.num_poses
+        active = np.arange(graph.num_poses) > 0 if whole else active
         found = part.settled(T, active)
         if found is None:
             return None
-        still = part.is_still(T, found, active)
-        T = found
-        if still:
-            judge = _Judge(jnp.asarray(part.deviations), jnp.asarray(part.width))
-            end = average_rounded(graph, judge, jax.device_put(T), None)
-            return eqx.tree_at(
-                lambda s: s.trace, end, previous.trace, is_leaf=lambda x: x is None
-            )
-        active = part.more(active)
-    return average_rounded(graph, method, jax.device_put(T), None)
+        still = whole or part.is_still(T, found, active)
+        T, active = found, part.more(active)
+    judge = _Judge(jnp.asarray(part.deviations), jnp.asarray(part.width))
+    end = average_rounded(graph, judge, jax.device_put(T), None)
+    return eqx.tree_at(
+        lambda s: s.trace, end, previous.trace, is_leaf=lambda x: x is None
+    )
 
 
 class _Judge(AbstractAverager):

@@ -28,8 +28,8 @@ from jaxreg.robust import Welsch
 # where these were too few: geometric, so that all tries together cost twice the last.
 _RINGS, _MORE = 2, 4
 # Outermost frames that move by no more than this share of the deviation of an edge
-# stand still: neighbours then move by less, and noise is a hundred times as large.
-_STILL = 0.01
+# stand still: as much lies between averaging 1,000 poses anew and from their poses.
+_STILL = 0.03
 
 
 class Part(NamedTuple):
