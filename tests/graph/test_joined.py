@@ -2,7 +2,7 @@
 
 import jax
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxreg.graph.joined import in_loops_of_three, joined
@@ -18,6 +18,7 @@ def _edges(seed: int, num_frames: int) -> np.ndarray:
     return rng.integers(0, num_frames, (NUM_EDGES, 2)).astype(np.int32)
 
 
+@settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), num_frames=st.integers(2, NUM_FRAMES))
 def test_edges_of_the_same_frames_share_a_row(seed: int, num_frames: int):
     edges = _edges(seed, num_frames)
@@ -29,6 +30,7 @@ def test_edges_of_the_same_frames_share_a_row(seed: int, num_frames: int):
     np.testing.assert_array_equal(np.flatnonzero(found.first), np.sort(first))
 
 
+@settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), num_frames=st.integers(3, NUM_FRAMES))
 def test_loops_are_those_of_a_dense_table(seed: int, num_frames: int):
     edges = _edges(seed, num_frames)

@@ -2,7 +2,7 @@
 
 import jax
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxreg.multiview.parts import in_main_body, part_numbers, part_sizes
@@ -18,12 +18,14 @@ def _lowest(label: np.ndarray) -> np.ndarray:
     return np.argmax(label[:, None] == label, axis=1).astype(np.int32)
 
 
+@settings(max_examples=50, deadline=None)
 @given(label=_LABELS)
 def test_sizes(label: list[int]):
     part = _lowest(np.array(label))
     np.testing.assert_array_equal(_SIZES(part), [label.count(x) for x in label])
 
 
+@settings(max_examples=50, deadline=None)
 @given(label=_LABELS, finer=_LABELS)
 def test_the_main_body_is_the_largest_and_of_equal_ones_the_first(
     label: list[int], finer: list[int]
@@ -35,6 +37,7 @@ def test_the_main_body_is_the_largest_and_of_equal_ones_the_first(
     np.testing.assert_array_equal(_MAIN(body, part), body == body[largest])
 
 
+@settings(max_examples=50, deadline=None)
 @given(label=_LABELS, which=st.integers(-1, NUM - 1))
 def test_parts_are_numbered_from_the_largest_and_the_known_world_first(
     label: list[int], which: int
