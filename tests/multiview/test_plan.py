@@ -69,6 +69,6 @@ def test_a_loop_is_closed_where_the_poses_say_that_scans_overlap():
 def test_of_long_loops_that_of_larger_overlap_is_closed():
     chain = np.stack([np.arange(99), np.arange(1, 100)], axis=1)
     trusted, part = np.ones(len(chain), bool), np.zeros(100, int)
-    near = np.array([[0, 40], [0, 90]])
-    pairs = next_pairs(chain, trusted, near, np.array([0.5, 0.4]), part, RNG)
-    assert [0, 40] in pairs.tolist()
+    near, overlap = np.array([[0, 40], [0, 90], [40, 99]]), np.array([0.4, 0.5, 0.9])
+    pairs = next_pairs(chain, trusted, near, overlap, part, RNG)
+    assert pairs.tolist() == [[0, 90], [40, 99]]
