@@ -1,6 +1,7 @@
 """From relative motions to poses: which pairs to trust, and which scans they place."""
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,7 +32,8 @@ _MIN_TRUST = 0.1
 # A mode agrees with poses within this, in radians and radii: half of what two modes of
 # a pair are apart.
 _AGREES = 0.15
-# Averages: of the best modes, then of those that agree with the poses from these.
+# Averages at most: of the best modes, then of those that agree with the poses from
+# these, where these are others.
 _PASSES = 2
 # Pairs that `register` would not believe may count where others confirm them: those
 # whose log evidence is at most so much below.
@@ -106,12 +108,29 @@ def place(
     if motions.num_modes == 1:
         return _averaged(motions, best, num_scans, averaging, least)
 
-    def again(mode: Array, _: None) -> tuple[Array, Placement]:
-        found = _averaged(motions, mode, num_scans, averaging, least)
-        return _agreeing(motions, found, least), found
+    def again(state: _Pass) -> _Pass:
+        found = _averaged(motions, state.mode, num_scans, averaging, least)
+        mode = _agreeing(motions, found, least)
+        return _Pass(mode, found, state.number + 1, jnp.any(mode != state.mode))
 
-    _, passes = control.scan(again, best, None, length=_PASSES)
-    return jax.tree.map(lambda x: x[-1], passes)
+    def unfinished(state: _Pass) -> Array:
+        return (state.number < _PASSES) & state.differs
+
+    start = jax.eval_shape(again, _Pass(best, None, jnp.asarray(0), jnp.asarray(True)))
+    start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
+    start = start._replace(mode=best, differs=jnp.asarray(True))
+    found = control.while_loop(unfinished, again, start).found
+    assert found is not None
+    return found
+
+
+class _Pass(NamedTuple):
+    """An average by some modes, and the modes that agree with it."""
+
+    mode: Int[Array, " e"]
+    found: Placement | None
+    number: Int[Array, ""]
+    differs: Bool[Array, ""]
 
 
 def _averaged(

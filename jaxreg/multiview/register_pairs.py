@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
+from jaxreg.batching.padding import rounded_up
 from jaxreg.batching.threads import map_in_threads
 from jaxreg.geometry import lie
 from jaxreg.multiview.choose_pairs import (
@@ -24,7 +25,7 @@ from jaxreg.multiview.follow_sequence import (
 )
 from jaxreg.multiview.likely_overlap import LikelyOverlap, NearPairs
 from jaxreg.multiview.method import min_log_evidence, num_kept
-from jaxreg.multiview.place import Placement, joins, place
+from jaxreg.multiview.place import Placement, joins, likely, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
 from jaxreg.multiview.workers import Workers
@@ -35,6 +36,9 @@ from jaxreg.registrar import AbstractRegistrar
 OnPairs = Callable[[RelativeMotions], None]
 
 _PAIRS_PER_BATCH, _THREADS = 4, 2
+# Scans from which on pairs that cannot count are left out of a round's average: it
+# takes longer by then than the programs of more sizes take to compile.
+_LARGE = 4_000
 
 
 class Rounds:
@@ -184,7 +188,7 @@ class Rounds:
         believed as an answer is. Scans that hang by few pairs need the best there is.
         """
         part = np.asarray(placement.part)
-        likely = float(min_log_evidence(self.method))
+        least = float(min_log_evidence(self.method))
         T = placement.T_world_i
         for done, (i, j) in enumerate(pairs.tolist()):
             if part[i] != part[j] or self._is_known((i, j)):
@@ -193,7 +197,7 @@ class Rounds:
             pair = jax.device_put(np.array([(i, j)], np.int32))
             T_i_j = lie.between(T[i], T[j])
             one = descended(self.method, self.scans, pair, T_i_j[None])
-            self._keep(one, likely if held[i] and held[j] else SURE)
+            self._keep(one, least if held[i] and held[j] else SURE)
 
     def _is_known(self, pair: tuple[int, int]) -> bool:
         return pair in self.row or pair in self.sure
@@ -212,10 +216,15 @@ class Rounds:
     def _evidence(self) -> tuple[Placement, np.ndarray, np.ndarray, NearPairs]:
         """Present poses, the pairs tried, those trusted, and those that may overlap."""
         found = RelativeMotions.joined(self.found)
-        num = len(found.overlap)
         least = jnp.asarray(min_log_evidence(self.method), self.scans.radius.dtype)
-        motions, num_scans = found.padded(self.most), self.scans.num_scans
+        num_scans = self.scans.num_scans
+        size, rows = self.most, np.arange(len(found.overlap))
+        if num_scans > _LARGE:
+            rows = np.flatnonzero(np.asarray(likely(found, least)).any(axis=1))
+            size = rounded_up(len(rows), an_octave=1)
+        motions = found.on_host(rows).padded(size)
         placement = place(motions, num_scans, self.averaging, least)
-        trusted = np.asarray(joins(placement.edge_weight))[:num]
-        near = self.overlaps.of(placement, seed=num)
+        trusted = np.zeros(len(found.overlap), bool)
+        trusted[rows] = np.asarray(joins(placement.edge_weight))[: len(rows)]
+        near = self.overlaps.of(placement, seed=len(found.overlap))
         return placement, np.asarray(found.pairs), trusted, near
