@@ -20,18 +20,21 @@ NUM, LENGTH, STEP = 24, 6, 1.0
 @pytest.fixture(scope="module")
 def street() -> tuple[PreparedScans, Placement]:
     """Scans of a wavy strip, each a step further, three wide to either side."""
+    scans = _prepared()
+    T = np.tile(np.eye(4, dtype=np.float32), (NUM, 1, 1))
+    T[:, 0, 3] = STEP * np.arange(NUM)
+    T[:, :3, 3] = (T[:, :3, 3] + np.asarray(scans.mean)) / float(scans.radius)
+    return scans, _placed(T)
+
+
+def _prepared() -> PreparedScans:
     rng = np.random.default_rng(0)
     local = rng.uniform(-0.5, 0.5, (NUM, 200, 2)) * [LENGTH, 2]
     x = local[..., 0] + STEP * np.arange(NUM)[:, None]
     z = 0.3 * np.sin(x) + 0.2 * np.cos(2 * local[..., 1])
     points = np.concatenate([local, z[..., None]], axis=-1).astype(np.float32)
-    scans = prepare_scans(
-        ParticleFilter(), jnp.asarray(points), jnp.ones(points.shape[:2], bool)
-    )
-    T = np.tile(np.eye(4, dtype=np.float32), (NUM, 1, 1))
-    T[:, 0, 3] = STEP * np.arange(NUM)
-    T[:, :3, 3] = (T[:, :3, 3] + np.asarray(scans.mean)) / float(scans.radius)
-    return scans, _placed(T)
+    mask = jnp.ones(points.shape[:2], bool)
+    return prepare_scans(ParticleFilter(), jnp.asarray(points), mask)
 
 
 def _placed(T_world_i: np.ndarray, part: np.ndarray | None = None) -> Placement:
@@ -100,6 +103,22 @@ def test_only_what_moved_is_looked_at_again(street, monkeypatch):
     assert len(seen[1]) == NUM - 1
     assert np.all(np.any(seen[1] == 7, axis=1))
     assert after[7, 8] != before[7, 8]
+
+
+def test_of_very_many_scans_tables_are_made_when_needed(street, monkeypatch):
+    scans, placed = street
+    jax.clear_caches()
+    monkeypatch.setattr("jaxreg.multiview.prepare._MOST_TABLES", NUM - 1)
+    without = _prepared()
+    assert without.tables is None
+    one = jnp.asarray(3)
+    tables = (x.table(ParticleFilter(), one) for x in (scans, without))
+    for held, made in zip(*map(jax.tree.leaves, tables), strict=True):
+        np.testing.assert_array_equal(held, made)
+    told, exact = (_told(LikelyOverlap(x).of(placed)) for x in (scans, without))
+    jax.clear_caches()
+    for pair, share in told.items():
+        assert exact[pair] == pytest.approx(share, abs=0.05)
 
 
 def test_partners_are_limited_and_padding_comes_last(street, monkeypatch):

@@ -218,7 +218,8 @@ def reconstruct_scans(
     result = result_of(sol, scans.points, scans.names)
     result = dataclasses.replace(result, covariances=_covariances(centred, sol))
     # The frame of a component's first scan; that of a scan alone means nothing.
-    first = np.argmax(result.component[:, None] == result.component, axis=1)
+    _, first, row = np.unique(result.component, return_index=True, return_inverse=True)
+    first = first[row]
     there, i, j = middles[first], *result.edges.T
     in_world = is_told(known) and result.status != Status.DEGENERATE
     if in_world:
