@@ -3,7 +3,7 @@
 import contextlib
 import multiprocessing
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 
 from jaxreg.io.errors import InputError
 from jaxreg.io.extras import require
@@ -20,6 +20,7 @@ def executor_of(told: str | None) -> Iterator[Executor | None]:
     Raises:
         InputError: if it is neither, or nothing answers there.
         MissingExtraError: if Dask is needed and not installed.
+        BrokenExecutor: instead of Dask's own where one of its workers was killed.
     """
     if told is None:
         yield None
@@ -39,7 +40,10 @@ def executor_of(told: str | None) -> Iterator[Executor | None]:
                 "tcp://HOST:8786."
             ) from err
         with client:
-            yield client.get_executor()
+            try:
+                yield client.get_executor()
+            except distributed.KilledWorker as err:  # after several tries
+                raise BrokenExecutor(str(err)) from err
 
 
 def _number(told: str) -> int:
