@@ -86,11 +86,12 @@ def _transfers_nothing_unasked(call: Callable[..., Any], *arrays: Any) -> None:
 
 
 def _concrete(base: type) -> set[type]:
-    """The classes of the package that are made, below an abstract one."""
+    """The public classes of the package that are made, below an abstract one."""
     found = set()
     for child in base.__subclasses__():
         found |= _concrete(child)
-        if child.__module__.startswith("jaxreg.") and not inspect.isabstract(child):
+        public = child.__module__.startswith("jaxreg.") and child.__name__[0] != "_"
+        if public and not inspect.isabstract(child):
             found.add(child)
     return found
 
