@@ -74,6 +74,20 @@ def test_a_change_of_unit_and_of_frame_changes_nothing(scans):
     np.testing.assert_allclose(other.log_evidence, plain.log_evidence, atol=0.3)
 
 
+def test_a_pair_is_as_likely_the_other_way_round():
+    # Beside what coincides, one cloud has points that lie a little off the other.
+    rng = np.random.default_rng(0)
+    off = floor(0)[:96] + [0, 0, 1] * rng.uniform(0.05, 0.15, (96, 1))
+    clouds = (
+        as_cloud(np.concatenate([floor(0), off]), np.tile(UP[:1], (352, 1))),
+        as_cloud(floor(0), UP),
+    )
+    there = witness(*clouds).of_pose(EYE)
+    back = witness(*clouds[::-1]).of_pose(EYE)
+    np.testing.assert_allclose(there.log_evidence, back.log_evidence, atol=1e-4)
+    assert abs(float(there.fitness - back.fitness)) > 0.05
+
+
 def test_thinning_changes_neither_verdict_nor_overlap():
     points, T_world_i = sculpture_scans(12, seed=0)
     clouds = []
