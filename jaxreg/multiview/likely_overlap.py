@@ -96,7 +96,7 @@ class LikelyOverlap:
         pairs = pairs[part[pairs[:, 0]] == part[pairs[:, 1]]]
         pairs = pairs[~self._held[pairs].all(axis=1)]
         keys = pair_keys(pairs, num)
-        T_i_j = _between(T, pairs)
+        T_i_j = np.linalg.inv(T)[pairs[:, 0]] @ T[pairs[:, 1]]
         overlap = self._known(keys, T_i_j)
         new = np.isnan(overlap)
         seen = likely_overlap(scans, placement, jax.device_put(pairs[new]))
@@ -164,16 +164,6 @@ def _near(found: Match, spacing: Scalar) -> Scalar:
     near = near & (~flat | (jnp.abs(found.plane_residual) < spacing))
     share = jnp.sum(near) / jnp.maximum(jnp.sum(found.mask), 1)
     return share.astype(spacing.dtype)
-
-
-def _between(T: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """`T_i_j` of pairs."""
-    R, t = T[:, :-1, :-1], T[:, :-1, -1]
-    i, j = pairs.T
-    out = np.tile(np.eye(T.shape[-1]), (len(pairs), 1, 1))
-    out[:, :-1, :-1] = np.einsum("nba,nbc->nac", R[i], R[j])
-    out[:, :-1, -1] = np.einsum("nba,nb->na", R[i], t[j] - t[i])
-    return out
 
 
 @kept_program

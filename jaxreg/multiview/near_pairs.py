@@ -36,14 +36,12 @@ def near_pairs(
         motions: those that were averaged.
         likely: what is known of overlaps; None under `jit`.
     """
-    num = scans.num_scans
-    every = jnp.stack(jnp.triu_indices(num, 1), axis=1)
-    if num <= ALL_UP_TO:
+    if likely is not None and scans.num_scans > ALL_UP_TO:
+        return _chosen(likely.of(placement).padded(), placement, motions.pairs)
+    every = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
+    if scans.num_scans <= ALL_UP_TO:
         return every
-    if likely is None:
-        near = NearPairs(every, likely_overlap(scans, placement, every))
-    else:
-        near = likely.of(placement).padded()
+    near = NearPairs(every, likely_overlap(scans, placement, every))
     return _chosen(near, placement, motions.pairs)
 
 
