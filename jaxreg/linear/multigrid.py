@@ -18,10 +18,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxreg._core import control
-from jaxreg.linear.aggregation import RATIO, aggregate
+from jaxreg.linear.aggregation import RATIO, Aggregates, aggregate
+from jaxreg.linear.carried import carried, carried_back, stiffness_carried_back
 from jaxreg.linear.krylov import conjugate_gradients
 from jaxreg.linear.operator import GraphLaplacian
 from jaxreg.linear.small import inverse_semidefinite, product
@@ -38,6 +39,18 @@ class _Level(NamedTuple):
     jacobi: Array  # (v, k, k) the damped Jacobi step; 0 for frames that nothing holds
     parent: Array  # (v,) frames of the next level
     held: Array  # (v,) 1, or 0 for frames that nothing holds
+    lever: Array | None  # (v, d) from the point of the parent, if there are points
+
+    def restricted(self, r: Array, num: int) -> Array:
+        """Forces on the `num` frames of the next level."""
+        if self.lever is not None:
+            r = carried_back(r, self.lever)
+        return jnp.zeros((num, *r.shape[1:]), r.dtype).at[self.parent].add(r)
+
+    def prolonged(self, x: Array) -> Array:
+        """Velocities of frames that move as their parents do."""
+        x = x[self.parent]
+        return x if self.lever is None else carried(x, self.lever)
 
 
 class Multigrid(NamedTuple):
@@ -57,15 +70,15 @@ class Multigrid(NamedTuple):
         held = level.held[:, None, None]
         x = product(level.jacobi, r)
         left = held * (r - level.matrix.mv(x))
-        x = x + held * self._below(number + 1, level.parent, left)[level.parent]
+        x = x + held * level.prolonged(self._below(number + 1, left))
         return x + product(level.jacobi, r - level.matrix.mv(x))
 
-    def _below(self, number: int, parent: Array, r: Array) -> Array:
+    def _below(self, number: int, r: Array) -> Array:
         """The solution on the next level."""
         last = number == len(self.levels)
         k = r.shape[1]
         num = self.bottom.shape[0] // k if last else self.levels[number].held.shape[0]
-        total = jnp.zeros((num, *r.shape[1:]), r.dtype).at[parent].add(r)
+        total = self.levels[number - 1].restricted(r, num)
         if last:
             return self._cycle(number, total)
         return conjugate_gradients(
@@ -97,25 +110,57 @@ def _coarser(matrix: GraphLaplacian) -> tuple[_Level, GraphLaplacian]:
     inverse = _block_inverses(diagonal)
     # The share of each edge in what holds its frames, whatever the coordinates.
     share = jnp.minimum(
-        jnp.sum(inverse[i] * weight, axis=(1, 2)),
+        jnp.sum(inverse[i] * matrix.weight_at_i(), axis=(1, 2)),
         jnp.sum(inverse[j] * weight, axis=(1, 2)),
     )
     share = jnp.where(i == j, 0, jnp.maximum(share, 0))
     agg = aggregate(edges, share, own.shape[0])
     count = -(-own.shape[0] // RATIO)
+    lever, origin, crossing = None, None, weight
+    if matrix.origin is not None:
+        origin = _middles(matrix.origin, agg.parent, count)
+        lever = matrix.origin - origin[agg.parent]
+        own = stiffness_carried_back(own, lever)
+        # An edge between aggregates may point the other way.
+        head = agg.edges[jnp.minimum(agg.slot, len(agg.edges) - 1), 1]
+        crossing = stiffness_carried_back(weight, matrix.origin[j] - origin[head])
     blocks = jnp.zeros((agg.edges.shape[0], k, k), own.dtype)
-    blocks = blocks.at[agg.slot].add(weight, mode="drop")
+    blocks = blocks.at[agg.slot].add(crossing, mode="drop")
     own = jnp.zeros((count, k, k), own.dtype).at[agg.parent].add(own)
-    lost = jnp.where(agg.lost[:, None, None], weight, 0)
     # Edges without room tie both ends to the ground: at least half as stiff, and stiff
     # where both ends move alike, so still safe.
     own = control.cond(
         jnp.any(agg.lost),
-        lambda: own.at[agg.parent[i]].add(lost).at[agg.parent[j]].add(lost),
+        lambda: own + _grounded(matrix, agg, origin, count),
         lambda: own,
     )
-    level = _Level(matrix, _DAMPED * inverse, agg.parent, held.astype(own.dtype))
-    return level, GraphLaplacian(agg.edges, blocks, own)
+    held = held.astype(own.dtype)
+    level = _Level(matrix, _DAMPED * inverse, agg.parent, held, lever)
+    return level, GraphLaplacian(agg.edges, blocks, own, origin)
+
+
+def _grounded(
+    matrix: GraphLaplacian, agg: Aggregates, origin: Array | None, count: int
+) -> Float[Array, "c k k"]:
+    """The stiffness of edges that found no room, at both ends."""
+    W = jnp.where(agg.lost[:, None, None], matrix.weight, 0)
+    out = jnp.zeros((count, *W.shape[1:]), W.dtype)
+    for end in agg.parent[matrix.edges].T:
+        at_end = W
+        if origin is not None and matrix.origin is not None:
+            shift = matrix.origin[matrix.edges[:, 1]] - origin[end]
+            at_end = stiffness_carried_back(W, shift)
+        out = out.at[end].add(at_end)
+    return out
+
+
+def _middles(
+    points: Float[Array, "v d"], parent: Int[Array, " v"], count: int
+) -> Float[Array, "c d"]:
+    """The mean point of the frames of each aggregate."""
+    num = jnp.zeros((count,), points.dtype).at[parent].add(1)
+    total = jnp.zeros((count, points.shape[1]), points.dtype).at[parent].add(points)
+    return total / jnp.maximum(num, 1)[:, None]
 
 
 def _block_inverses(A: Float[Array, "v k k"]) -> Float[Array, "v k k"]:

@@ -12,24 +12,28 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float, Int
 
+from jaxreg.linear.carried import carried, carried_back, stiffness_carried_back
 from jaxreg.linear.small import product
 
 
 class GraphLaplacian(lx.AbstractLinearOperator):
-    """sum_e (x_j - x_i)' W_e (x_j - x_i) + sum_i x_i' own_i x_i, as a matrix.
+    """sum_e (x_j - C_ij x_i)' W_e (x_j - C_ij x_i) + sum_i x_i' own_i x_i, a matrix.
 
     It maps `(v, k, c)`, c columns that it treats alike and apart.
 
     Attributes:
         edges: `(e, 2)` frames i and j.
-        weight: `(e, k, k)` symmetric positive semidefinite.
+        weight: `(e, k, k)` symmetric positive semidefinite, at the point of j.
         own: `(v, k, k)` what ties each frame to the ground.
+        origin: `(v, d)` the point of each frame; None where all x are taken at the same
+            one, or are no velocities: C_ij is 1.
         columns: c (static).
     """
 
     edges: Int[Array, "e 2"]
     weight: Float[Array, "e k k"]
     own: Float[Array, "v k k"]
+    origin: Float[Array, "v d"] | None = None
     columns: int = eqx.field(static=True, default=1)
 
     @classmethod
@@ -39,6 +43,7 @@ class GraphLaplacian(lx.AbstractLinearOperator):
         weight: Float[Array, "e k k"],
         num_poses: int,
         damping: Float[Array, ""] | float = 0.0,
+        origin: Float[Array, "v d"] | None = None,
         columns: int = 1,
     ) -> "GraphLaplacian":
         """With `damping` times its diagonal, and frame 0 tied to the ground.
@@ -47,28 +52,53 @@ class GraphLaplacian(lx.AbstractLinearOperator):
         solutions are those with x_0 = 0.
         """
         none = jnp.zeros((num_poses, *weight.shape[1:]), weight.dtype)
-        blocks = cls(edges, weight, none).blocks()
-        return cls(edges, weight, (damping * blocks).at[0].add(blocks[0]), columns)
+        blocks = cls(edges, weight, none, origin).blocks()
+        own = (damping * blocks).at[0].add(blocks[0])
+        return cls(edges, weight, own, origin, columns)
 
     def mv(self, vector: Float[Array, "v k c"]) -> Float[Array, "v k c"]:
         """The product, one pass over the edges."""
         i, j = self.edges[:, 0], self.edges[:, 1]
-        flow = product(self.weight, vector[j] - vector[i])
-        return product(self.own, vector).at[j].add(flow).at[i].add(-flow)
+        seen = vector[i] if self.origin is None else carried(vector[i], self.levers)
+        flow = product(self.weight, vector[j] - seen)
+        return product(self.own, vector) + self.divergence(flow)
+
+    def divergence(self, flow: Float[Array, "e k c"]) -> Float[Array, "v k c"]:
+        """B' flow: the forces of the edges on their frames."""
+        i, j = self.edges[:, 0], self.edges[:, 1]
+        back = flow if self.origin is None else carried_back(flow, self.levers)
+        out = jnp.zeros((len(self.own), *flow.shape[1:]), flow.dtype)
+        return out.at[j].add(flow).at[i].add(-back)
+
+    @property
+    def levers(self) -> Float[Array, "e d"]:
+        """From the point of i to that of j."""
+        assert self.origin is not None
+        return self.origin[self.edges[:, 1]] - self.origin[self.edges[:, 0]]
+
+    def weight_at_i(self) -> Float[Array, "e k k"]:
+        """The weights seen from the points of i."""
+        if self.origin is None:
+            return self.weight
+        return stiffness_carried_back(self.weight, self.levers)
 
     def blocks(self) -> Float[Array, "v k k"]:
         """The blocks of the diagonal."""
         i, j = self.edges[:, 0], self.edges[:, 1]
-        return self.own.at[i].add(self.weight).at[j].add(self.weight)
+        return self.own.at[i].add(self.weight_at_i()).at[j].add(self.weight)
 
     def dense(self) -> Float[Array, "n n"]:
         """`(v k, v k)`, for few frames: the matrix of one column."""
         num, k = self.own.shape[:2]
         i, j = self.edges[:, 0], self.edges[:, 1]
+        # What frame i does to frame j.
+        across = self.weight
+        if self.origin is not None:
+            across = jnp.swapaxes(carried_back(across, self.levers), -1, -2)
         frame = jnp.arange(num)
         full = jnp.zeros((num, num, k, k), self.own.dtype)
         full = full.at[frame, frame].add(self.blocks())
-        full = full.at[i, j].add(-self.weight).at[j, i].add(-self.weight)
+        full = full.at[j, i].add(-across).at[i, j].add(-jnp.swapaxes(across, -1, -2))
         return full.transpose(0, 2, 1, 3).reshape(num * k, num * k)
 
     def as_matrix(self) -> Float[Array, "n n"]:

@@ -25,6 +25,7 @@ from jaxreg.averaging.likelihood import (
 )
 from jaxreg.averaging.measures import weighted_mean
 from jaxreg.averaging.steps.edge_errors import LogError
+from jaxreg.averaging.steps.edge_problem import Problem, robust_problem
 from jaxreg.averaging.steps.gauss_newton import precisions
 from jaxreg.averaging.steps.gradients import gauss_newton_gradients
 from jaxreg.averaging.steps.iterate import Iterated, pose_change
@@ -34,13 +35,7 @@ from jaxreg.averaging.steps.kernel_width import (
     spare_factor,
     variance_inside,
 )
-from jaxreg.averaging.steps.levenberg_marquardt import (
-    Minimum,
-    Problem,
-    minimise,
-    no_cycle,
-    robust_problem,
-)
+from jaxreg.averaging.steps.levenberg_marquardt import Minimum, minimise, no_cycle
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph

@@ -29,15 +29,13 @@ from jaxreg.averaging.steps.charts import Minimum as SolverMinimum
 from jaxreg.averaging.steps.charts import minimise_by
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError, LogError
 from jaxreg.averaging.steps.edge_jacobian import edge_jacobian
+from jaxreg.averaging.steps.edge_problem import Problem, robust_problem
 from jaxreg.averaging.steps.implicit import differentiable
-from jaxreg.averaging.steps.levenberg_marquardt import (
-    Minimum,
-    Problem,
-    minimise,
-    robust_problem,
-)
+from jaxreg.averaging.steps.levenberg_marquardt import Minimum, minimise
 from jaxreg.averaging.trace import AveragingTrace
+from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.linear.carried import carried, carried_back
 from jaxreg.linear.multigrid import multigrid
 from jaxreg.linear.operator import GraphLaplacian, divergence
 from jaxreg.robust import AbstractKernel
@@ -165,11 +163,12 @@ class PoseGraphLM(AbstractAverager):
         self, graph: PoseGraph, problem: Problem, T: Float[Array, "v D D"]
     ) -> Float[Array, "v D D"]:
         """The same poses, with derivatives by the balance of forces at the minimum."""
-        Q = problem.normal(T)[0]
+        origin = lie.translation(T)
+        Q = problem.normal(T, origin)[0]
         stiffness = jnp.trace(Q, axis1=-2, axis2=-1)
         top = jnp.max(stiffness)
         weight = stiffness / jnp.where(top > 0, top, 1)
-        precondition = eqx.Partial(_nearly_balanced, graph.edges, Q)
+        precondition = eqx.Partial(_nearly_balanced, graph.edges, Q, origin)
         jacobian = eqx.Partial(edge_jacobian, self._imbalance)
         return differentiable(graph, T, self._imbalance, weight, jacobian, precondition)
 
@@ -186,10 +185,11 @@ class PoseGraphLM(AbstractAverager):
         return robust_problem(graph, error, precision, self.kernel, width)
 
 
-def _nearly_balanced(edges: Array, Q: Array, rows: Array) -> Array:
-    """Tangents that about undo an imbalance."""
+def _nearly_balanced(edges: Array, Q: Array, origin: Array, rows: Array) -> Array:
+    """Tangents that about undo an imbalance, both at the origin of the world."""
     # What arrives at pose 0 leaves the others.
     rows = rows.at[0].set(-jnp.sum(rows[1:], axis=0))
-    inverse = multigrid(GraphLaplacian.anchored(edges, Q, len(rows)))
-    x = inverse(-rows[..., None])[..., 0]
+    matrix = GraphLaplacian.anchored(edges, Q, len(rows), origin=origin)
+    x = multigrid(matrix)(carried_back(-rows[..., None], -origin))
+    x = carried(x, -origin)[..., 0]
     return x - x[0]

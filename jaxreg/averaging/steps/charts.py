@@ -14,7 +14,7 @@ from jaxreg._core.loop import iterate
 from jaxreg._core.restarts import MAX_STARTS, AbstractRestarts
 from jaxreg._core.solver import Lowered, Solver
 from jaxreg._core.typing import Scalar
-from jaxreg.averaging.steps.levenberg_marquardt import Problem
+from jaxreg.averaging.steps.edge_problem import Problem
 from jaxreg.geometry import lie
 from jaxreg.linear.small import product, root_semidefinite
 
