@@ -10,7 +10,9 @@ from contextvars import ContextVar
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool
 
 from jaxreg._core import control
 from jaxreg._core.checks import is_concrete
@@ -62,3 +64,28 @@ def by_platform(cpu: Callable[[], Out], accelerator: Callable[[], Out]) -> Out:
     if platform is None:
         return lax.platform_dependent(cpu=cpu, default=accelerator)
     return cpu() if platform == "cpu" else accelerator()
+
+
+def written_first(
+    function: Callable[..., Out], *operands: Any, true: Bool[Array, ""]
+) -> Out:
+    """`function(*operands)`, written to memory before it is used.
+
+    On a CPU, XLA computes it anew at each use instead: of products of 6 x 6 matrices
+    with differences of gathered rows all six entries gather again, and the scatters of
+    what comes out multiply again.
+
+    Args:
+        function: of arrays.
+        operands: its arguments.
+        true: always so, but the compiler must not know.
+    """
+
+    def never(*operands: Any) -> Any:
+        shapes = jax.eval_shape(function, *operands)
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    return by_platform(
+        lambda: control.cond(true, lambda *x: function(*x), never, *operands),
+        lambda: function(*operands),
+    )

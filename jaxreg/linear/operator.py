@@ -6,14 +6,21 @@ has D = B (x) I_k with B the weighted incidence matrix), k x k ones in Gauss-New
 steps with left tangents. It is never formed beyond its blocks, unless asked for.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core.platforms import written_first
 from jaxreg.linear.carried import carried, carried_back, stiffness_carried_back
 from jaxreg.linear.small import product
+
+
+# Edges from which on what is computed once and not at each use is worth a branch.
+_MANY = 4096
 
 
 class GraphLaplacian(lx.AbstractLinearOperator):
@@ -58,10 +65,14 @@ class GraphLaplacian(lx.AbstractLinearOperator):
 
     def mv(self, vector: Float[Array, "v k c"]) -> Float[Array, "v k c"]:
         """The product, one pass over the edges."""
+        strain = self._once(self._strain, vector)
+        flow = self._once(product, self.weight, strain)
+        return product(self.own, vector) + self.divergence(flow)
+
+    def _strain(self, vector: Float[Array, "v k c"]) -> Float[Array, "e k c"]:
         i, j = self.edges[:, 0], self.edges[:, 1]
         seen = vector[i] if self.origin is None else carried(vector[i], self.levers)
-        flow = product(self.weight, vector[j] - seen)
-        return product(self.own, vector) + self.divergence(flow)
+        return vector[j] - seen
 
     def divergence(self, flow: Float[Array, "e k c"]) -> Float[Array, "v k c"]:
         """B' flow: the forces of the edges on their frames."""
@@ -69,6 +80,11 @@ class GraphLaplacian(lx.AbstractLinearOperator):
         back = flow if self.origin is None else carried_back(flow, self.levers)
         out = jnp.zeros((len(self.own), *flow.shape[1:]), flow.dtype)
         return out.at[j].add(flow).at[i].add(-back)
+
+    def _once(self, function: Callable[..., Array], *operands: Array) -> Array:
+        if len(self.edges) < _MANY:
+            return function(*operands)
+        return written_first(function, *operands, true=self.edges[0, 0] >= 0)
 
     @property
     def levers(self) -> Float[Array, "e d"]:
@@ -80,7 +96,7 @@ class GraphLaplacian(lx.AbstractLinearOperator):
         """The weights seen from the points of i."""
         if self.origin is None:
             return self.weight
-        return stiffness_carried_back(self.weight, self.levers)
+        return self._once(stiffness_carried_back, self.weight, self.levers)
 
     def blocks(self) -> Float[Array, "v k k"]:
         """The blocks of the diagonal."""

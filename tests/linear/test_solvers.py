@@ -76,3 +76,46 @@ def test_steps_that_run_out_are_told(system):
     )
     assert found.result == lx.RESULTS.max_steps_reached
     assert int(found.stats["num_steps"]) == 2
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_velocities_may_be_taken_at_other_points(d):
+    rng, num, k = np.random.default_rng(1), 40, 3 * d - 3
+    edges = np.stack([np.arange(num - 1), np.arange(1, num)], axis=1)
+    far = rng.integers(0, num, 30)
+    far = np.stack([far, (far + rng.integers(1, num, 30)) % num], axis=1)
+    edges = np.concatenate([edges, far])
+    root = rng.normal(size=(len(edges), k, k))
+    origin = rng.normal(size=(num, d))
+    # x at the origin of the world, as the points of the frames move by it.
+    carry = np.stack([_carrying(p) for p in origin])
+    away = np.linalg.inv(carry)[edges[:, 1]]
+    W = root @ root.swapaxes(1, 2)
+    at_j = away.swapaxes(1, 2) @ W @ away
+    pairs = jnp.asarray(edges)
+    world = GraphLaplacian.anchored(pairs, jnp.asarray(W), num, 0.1).dense()
+    local = GraphLaplacian.anchored(
+        pairs, jnp.asarray(at_j), num, 0.1, jnp.asarray(origin)
+    )
+    C = np.zeros((num, k, num, k))
+    C[np.arange(num), :, np.arange(num)] = carry
+    C = C.reshape(num * k, num * k)
+    np.testing.assert_allclose(C.T @ local.dense() @ C, world, atol=1e-9)
+    x = rng.normal(size=(num, k, 2))
+    found = local.mv(jnp.asarray(x))
+    expected = np.asarray(local.dense()) @ x.reshape(num * k, 2)
+    np.testing.assert_allclose(found.reshape(num * k, 2), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        np.asarray(local.blocks()),
+        np.asarray(local.dense()).reshape(num, k, num, k)[range(num), :, range(num)],
+        atol=1e-9,
+    )
+
+
+def _carrying(point: np.ndarray) -> np.ndarray:
+    """The velocity at a point and the turn, from those at 0."""
+    d = len(point)
+    C = np.eye(3 * d - 3)
+    for row, turn in enumerate(np.eye(3) if d == 3 else [[0, 0, 1.0]]):
+        C[:d, d + row] = np.cross(turn, np.pad(point, (0, 3 - d)))[:d]
+    return C

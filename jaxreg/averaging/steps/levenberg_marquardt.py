@@ -210,7 +210,9 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
 
 
 def _tangents(
-    matrix: GraphLaplacian, force: Array, solver: Multigrid | LinearSolver
+    matrix: GraphLaplacian,
+    force: Array,
+    solver: Multigrid | LinearSolver,
 ) -> tuple[Array, Array]:
     """Left tangents x of the normal equations B' Q B x = -B' f, and the rounds.
 
