@@ -20,6 +20,8 @@ from jaxreg._core.checks import is_concrete
 
 Out = TypeVar("Out")
 
+# Rows from which on a branch of the program costs less than it saves.
+_MANY = 4096
 #: What the program is for that is traced; None if it is not known.
 _PLATFORM: ContextVar[str | None] = ContextVar("platform", default=None)
 
@@ -66,10 +68,8 @@ def by_platform(cpu: Callable[[], Out], accelerator: Callable[[], Out]) -> Out:
     return cpu() if platform == "cpu" else accelerator()
 
 
-def written_first(
-    function: Callable[..., Out], *operands: Any, true: Bool[Array, ""]
-) -> Out:
-    """`function(*operands)`, written to memory before it is used.
+def once(function: Callable[..., Out], *operands: Array, true: Bool[Array, ""]) -> Out:
+    """`function(*operands)` of many rows, written to memory before it is used.
 
     On a CPU, XLA computes it anew at each use instead: of products of 6 x 6 matrices
     with differences of gathered rows all six entries gather again, and the scatters of
@@ -77,9 +77,11 @@ def written_first(
 
     Args:
         function: of arrays.
-        operands: its arguments.
+        operands: its arguments; the first has a row for each of the many.
         true: always so, but the compiler must not know.
     """
+    if len(operands[0]) < _MANY:
+        return function(*operands)
 
     def never(*operands: Any) -> Any:
         shapes = jax.eval_shape(function, *operands)

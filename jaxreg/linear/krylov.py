@@ -34,6 +34,7 @@ def conjugate_gradients(
     *,
     tolerance: float | Array,
     max_steps: int,
+    energy: float | Array = 0.0,
 ) -> tuple[Float[Array, "v k c"], Int[Array, ""]]:
     """Solves `apply(x) = rhs` for a positive semidefinite map and a rhs in its range.
 
@@ -47,6 +48,8 @@ def conjugate_gradients(
         tolerance: the last step is the one before which the residual, in the norm of
             the preconditioner, is below this share of its first value.
         max_steps: largest number of steps.
+        energy: the same, before which the squared residual in that norm is below: what
+            x' apply(x) about lacks.
 
     Returns:
         The solutions and the number of steps.
@@ -61,7 +64,8 @@ def conjugate_gradients(
     def step(s: _State) -> _State:
         z = precondition(s.r)
         rz = dot(s.r, z)
-        stop = jnp.where(s.step == 0, tolerance**2 * rz, s.stop)
+        enough = jnp.maximum(tolerance**2 * rz, energy)
+        stop = jnp.where(s.step == 0, enough, s.stop)
         curved = s.curvature > 0
         beta = jnp.where(curved, -dot(z, s.Ap) / jnp.where(curved, s.curvature, 1), 0)
         p = z + beta[None, None] * s.p

@@ -6,21 +6,15 @@ has D = B (x) I_k with B the weighted incidence matrix), k x k ones in Gauss-New
 steps with left tangents. It is never formed beyond its blocks, unless asked for.
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxreg._core.platforms import written_first
+from jaxreg._core.platforms import once
 from jaxreg.linear.carried import carried, carried_back, stiffness_carried_back
 from jaxreg.linear.small import product
-
-
-# Edges from which on what is computed once and not at each use is worth a branch.
-_MANY = 4096
 
 
 class GraphLaplacian(lx.AbstractLinearOperator):
@@ -65,11 +59,12 @@ class GraphLaplacian(lx.AbstractLinearOperator):
 
     def mv(self, vector: Float[Array, "v k c"]) -> Float[Array, "v k c"]:
         """The product, one pass over the edges."""
-        strain = self._once(self._strain, vector)
-        flow = self._once(product, self.weight, strain)
+        strain = once(self.strain, vector, true=self._true)
+        flow = once(product, self.weight, strain, true=self._true)
         return product(self.own, vector) + self.divergence(flow)
 
-    def _strain(self, vector: Float[Array, "v k c"]) -> Float[Array, "e k c"]:
+    def strain(self, vector: Float[Array, "v k c"]) -> Float[Array, "e k c"]:
+        """B x: the difference on each edge, seen from the point of j."""
         i, j = self.edges[:, 0], self.edges[:, 1]
         seen = vector[i] if self.origin is None else carried(vector[i], self.levers)
         return vector[j] - seen
@@ -81,10 +76,9 @@ class GraphLaplacian(lx.AbstractLinearOperator):
         out = jnp.zeros((len(self.own), *flow.shape[1:]), flow.dtype)
         return out.at[j].add(flow).at[i].add(-back)
 
-    def _once(self, function: Callable[..., Array], *operands: Array) -> Array:
-        if len(self.edges) < _MANY:
-            return function(*operands)
-        return written_first(function, *operands, true=self.edges[0, 0] >= 0)
+    @property
+    def _true(self) -> Bool[Array, ""]:
+        return self.edges[0, 0] >= 0
 
     @property
     def levers(self) -> Float[Array, "e d"]:
@@ -96,7 +90,7 @@ class GraphLaplacian(lx.AbstractLinearOperator):
         """The weights seen from the points of i."""
         if self.origin is None:
             return self.weight
-        return self._once(stiffness_carried_back, self.weight, self.levers)
+        return once(stiffness_carried_back, self.weight, self.levers, true=self._true)
 
     def blocks(self) -> Float[Array, "v k k"]:
         """The blocks of the diagonal."""

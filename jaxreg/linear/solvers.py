@@ -90,7 +90,8 @@ class MultigridCG(AbstractSymmetricSolver[tuple[GraphLaplacian, Multigrid]]):
             its first value, at best that of the dtype.
         max_steps: at most; stats have `num_steps`.
 
-    Options: `preconditioner`, a `Multigrid` of a similar matrix.
+    Options: `preconditioner`, a `Multigrid` of a similar matrix; `energy`, which the
+    solution may lack.
     """
 
     rtol: float
@@ -118,6 +119,7 @@ class MultigridCG(AbstractSymmetricSolver[tuple[GraphLaplacian, Multigrid]]):
             vector,
             tolerance=max(self.rtol, least),
             max_steps=self.max_steps,
+            energy=options.get("energy", 0.0),
         )
         result = lx.RESULTS.where(
             num_steps < self.max_steps,

@@ -164,7 +164,7 @@ class PoseGraphLM(AbstractAverager):
     ) -> Float[Array, "v D D"]:
         """The same poses, with derivatives by the balance of forces at the minimum."""
         origin = lie.translation(T)
-        Q = problem.normal(T, origin)[0]
+        Q = problem.normal(T, origin).stiffness
         stiffness = jnp.trace(Q, axis1=-2, axis2=-1)
         top = jnp.max(stiffness)
         weight = stiffness / jnp.where(top > 0, top, 1)
@@ -173,7 +173,7 @@ class PoseGraphLM(AbstractAverager):
         return differentiable(graph, T, self._imbalance, weight, jacobian, precondition)
 
     def _imbalance(self, graph: PoseGraph, T: Array) -> Array:
-        force = self.problem(graph).normal(T)[1]
+        force = self.problem(graph).normal(T).force
         return -divergence(graph.edges, force, graph.num_poses)
 
     def problem(self, graph: PoseGraph) -> Problem:

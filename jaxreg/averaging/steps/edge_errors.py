@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core.brief import BriefModule
+from jaxreg._core.platforms import once
 from jaxreg.geometry import lie
 from jaxreg.graph.chordal import chordal_weights
 from jaxreg.graph.pose_graph import PoseGraph
@@ -46,7 +47,9 @@ class LogError(AbstractEdgeError):
         self, predicted: Float[Array, "e D D"], T_i_j: Float[Array, "e D D"]
     ) -> Float[Array, "e k"]:
         """The tangent from the measured to the predicted motion."""
-        return lie.log(lie.between(T_i_j, predicted))
+        # The last entry is one; it may be NaN.
+        gap = once(lie.between, T_i_j, predicted, true=~(T_i_j[0, -1, -1] <= 0))
+        return lie.log(gap)
 
     def jacobian(
         self, predicted: Float[Array, "e D D"], error: Float[Array, "e k"]

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from jaxreg._core.platforms import once
 from jaxreg.averaging.steps.edge_errors import AbstractEdgeError
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
@@ -26,41 +27,57 @@ class Problem(NamedTuple):
     def squares(self, T: Array) -> Array:
         """The squared error r' Omega r of each edge."""
         r = self.errors(T)
-        return jnp.sum(r * self._weighted(r[..., None])[..., 0], axis=-1)
+        return jnp.sum(r * self._weighted(r), axis=-1)
 
     def errors(self, T: Array) -> Array:
         """The error r of each edge."""
-        return self.error.value(self.graph.predicted(T), self.graph.T_i_j)
+        return self._errors(self._predicted(T))
 
-    def _weighted(self, J: Array) -> Array:
+    def _predicted(self, T: Array) -> Array:
+        return once(self.graph.predicted, T, true=self._true)
+
+    def _errors(self, predicted: Array) -> Array:
+        return once(self.error.value, predicted, self.graph.T_i_j, true=self._true)
+
+    def _weighted(self, r: Array) -> Array:
+        """Omega r."""
         if self.precision.ndim == 2:
-            return self.precision[..., None] * J
-        return product(self.precision, J)
+            return self.precision * r
+        return once(product, self.precision, r[..., None], true=self._true)[..., 0]
+
+    @property
+    def _true(self) -> Bool[Array, ""]:
+        return self.graph.edges[0, 0] >= 0
 
     def cost(self, T: Array) -> Array:
         """The objective."""
         return jnp.sum(self.loss(self.squares(T)))
 
-    def normal(
-        self, T: Array, origin: Float[Array, "v d"] | None = None
-    ) -> tuple[Array, Array]:
-        """J' Omega J `(e, k, k)` and J' Omega r `(e, k)` with respect to x_j - x_i.
-
-        Of left tangents at `origin[j]`, or at the origin of the world.
-        """
-        predicted = self.graph.predicted(T)
-        r = self.error.value(predicted, self.graph.T_i_j)
+    def normal(self, T: Array, origin: Float[Array, "v d"] | None = None) -> "Normal":
+        """With respect to x_j - x_i, left tangents at `origin[j]`, or at 0."""
+        predicted = self._predicted(T)
+        r = self._errors(predicted)
         # A left tangent of both ends turns the predicted motion from the right.
         seen = T if origin is None else moved_by(T, -origin)
-        J = product(
-            self.error.jacobian(predicted, r),
-            lie.adjoint(lie.inverse(seen))[self.graph.edges[:, 1]],
-        )
-        WJ = self._weighted(J)
-        force = jnp.sum(WJ * r[:, :, None], axis=-2)
-        trust = self.trust(jnp.sum(r * self._weighted(r[..., None])[..., 0], axis=-1))
+        turn = lie.adjoint(lie.inverse(seen))[self.graph.edges[:, 1]]
+        J = product(self.error.jacobian(predicted, r), turn)
+        Wr = self._weighted(r)
+        trust = self.trust(jnp.sum(r * Wr, axis=-1))
+        force = jnp.sum(J * Wr[:, :, None], axis=-2)
+        if self.precision.ndim == 2:
+            WJ = self.precision[..., None] * J
+        else:
+            WJ = product(self.precision, J)
         Q = product(jnp.swapaxes(J, -1, -2), trust[:, None, None] * WJ)
-        return Q, trust[:, None] * force
+        return Normal(Q, trust[:, None] * force, trust)
+
+
+class Normal(NamedTuple):
+    """What the edges give to the normal equations."""
+
+    stiffness: Float[Array, "e k k"]  # J' Omega J
+    force: Float[Array, "e k"]  # J' Omega r
+    trust: Float[Array, " e"]
 
 
 def moved_by(T: Float[Array, "v D D"], shift: Float[Array, "v d"]) -> Array:
