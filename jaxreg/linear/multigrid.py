@@ -85,7 +85,7 @@ class Multigrid(NamedTuple):
             self.levels[number].matrix.mv,
             lambda r: self._cycle(number, r),
             total,
-            tolerance=0,
+            tolerance=0.0,
             max_steps=_INNER,
         )[0]
 

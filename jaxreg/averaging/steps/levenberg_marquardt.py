@@ -170,8 +170,7 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         x, rounds = _tangents(
             matrix, of_edges.force, self.linear_solver or inverse, spared
         )
-        T = _moved(s.T, x, origin)
-        cost = problem.cost(T)
+        T, cost = _best_of_ways(problem, s.T, x, origin)
         better = cost <= s.cost + _rounding(s.T, s.cost, of_edges)
         gain = jnp.where(
             s.cost > 0, (s.cost - cost) / jnp.where(s.cost > 0, s.cost, 1), 0
@@ -218,17 +217,26 @@ def _rounding(T: Array, cost: Array, of_edges: Normal) -> Float[Array, ""]:
     return jnp.finfo(cost.dtype).eps * (ROUNDING * cost + far)
 
 
-def _moved(T: Array, x: Array, origin: Array) -> Float[Array, "v D D"]:
-    """Poses that turn where they are and shift on straight lines.
+def _best_of_ways(
+    problem: Problem, T: Array, x: Array, origin: Array
+) -> tuple[Float[Array, "v D D"], Float[Array, ""]]:
+    """Poses after a step, and their cost: along screws, or straight.
 
-    On the arcs of exp(x), poses far from what they turn about would shift too far or
-    too little by half the shift times the turn between neighbours: on a tube 2,000
-    edges long more than the noise, so that whole steps raised the cost.
+    Between neighbours that turn by w and w + u, and shift by v, poses that go along
+    screws, the arcs of exp(x), leave the step by u x v / 2: on a tube 2,000 edges long
+    more than the noise, so that whole steps raised the cost. Poses that turn where they
+    are and shift on straight lines stretch an edge by w^2 / 2: too much for
+    parking-garage, which turns alike over long distances.
     """
     place, d = lie.translation(T), T.shape[-1] - 1
     at_place = carried(x[..., None], place - origin)[..., 0]
-    turn = product(lie.rotation_exp(at_place[:, d:]), lie.rotation(T))
-    return lie.straightened(lie.compose(turn, place + at_place[:, :d]))
+    arc = lie.exp(at_place)
+    turned = product(lie.rotation(arc), lie.rotation(T))
+    shifts = jnp.stack([lie.translation(arc), at_place[:, :d]])
+    ways = lie.straightened(lie.compose(turned[None], place[None] + shifts))
+    costs = jax.lax.map(problem.cost, ways)
+    best = jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))
+    return ways[best], costs[best]
 
 
 def _tangents(
