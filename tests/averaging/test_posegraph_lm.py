@@ -194,3 +194,25 @@ def test_what_is_no_solver_is_refused():
         PoseGraphLM(linear_solver=optimistix.BFGS(1e-6, 1e-6))
     with pytest.raises(ValueError, match="one of their own"):
         PoseGraphLM(solver=optimistix.BFGS(1e-6, 1e-6), linear_solver=lineax.Cholesky())
+
+
+def test_one_step_straightens_a_long_path_that_drifted():
+    # Turns of 1e-3 at random: a start 2,500 edges long that bends by a twentieth. On
+    # the arcs of exp(x) its far end leaves the step by more than the noise.
+    num = 2500
+    turn = 1e-3 * np.random.default_rng(0).normal(size=num - 1)
+    angle = np.cumsum(np.append(0, turn))
+    c, s = np.cos(angle), np.sin(angle)
+    place = np.cumsum(np.stack([c, s], axis=1), axis=0)
+    bent = motions(np.moveaxis(np.array([[c, -s], [s, c]]), -1, 0), place)
+    edges = np.stack([np.arange(num - 1), np.arange(1, num)], axis=1)
+    ahead = np.tile(np.eye(3), (num - 1, 1, 1))
+    ahead[:, 0, 2] = 1
+    information = np.tile(np.diag([2500.0, 2500, 1e4]), (num - 1, 1, 1))
+    with jax.enable_x64(True):
+        graph = PoseGraph.from_edges(edges, ahead, num, None, information)
+        start = jnp.asarray(np.linalg.inv(bent[0]) @ bent)
+        T = np.asarray(average(graph, PoseGraphLM(max_steps=1), init=start).T_world_i)
+    left = np.linalg.inv(ahead) @ np.linalg.inv(T[:-1]) @ T[1:]
+    assert np.std(left[:, 1, 0]) < 0.1 * np.std(turn)
+    assert np.abs(left[:, :2, 2]).max() < 1e-3

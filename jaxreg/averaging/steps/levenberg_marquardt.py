@@ -233,7 +233,8 @@ def _best_of_ways(
     arc = lie.exp(at_place)
     turned = product(lie.rotation(arc), lie.rotation(T))
     shifts = jnp.stack([lie.translation(arc), at_place[:, :d]])
-    ways = lie.straightened(lie.compose(turned[None], place[None] + shifts))
+    turned = jnp.broadcast_to(turned, (2, *turned.shape))
+    ways = lie.straightened(lie.compose(turned, place[None] + shifts))
     costs = jax.lax.map(problem.cost, ways)
     best = jnp.argmin(jnp.where(jnp.isnan(costs), jnp.inf, costs))
     return ways[best], costs[best]
