@@ -195,3 +195,27 @@ def test_far_from_the_origin_single_precision_still_holds():
     assert int(single[0]) <= 1.5 * int(best[0])
     # The energy of the solution: with all tangents at one origin 14,157 for 15,885.
     np.testing.assert_allclose(single[1], best[1], rtol=3e-3)
+
+
+def test_a_coarser_level_of_frames_at_points_is_as_stiff_as_bodies():
+    num, k = 120, 3
+    rng = np.random.default_rng(0)
+    edges = np.stack([np.arange(num - 1), np.arange(1, num)], axis=1)
+    edges = np.where(rng.random((num - 1, 1)) < 0.5, edges, edges[:, ::-1])
+    root = rng.normal(size=(num - 1, k, k))
+    with jax.enable_x64(True):
+        matrix = GraphLaplacian.anchored(
+            jnp.asarray(edges, jnp.int32),
+            jnp.asarray(root @ root.swapaxes(1, 2)),
+            num,
+            0.1,
+            jnp.asarray(np.cumsum(rng.normal(size=(num, 2)), axis=0)),
+        )
+        level, coarser = jax.jit(_coarser)(matrix)
+        count = coarser.own.shape[0]
+        unit = jnp.eye(count * k).reshape(count, k, count * k)
+        P = np.asarray(level.prolonged(unit)).reshape(num * k, count * k)
+        expected = P.T @ np.asarray(matrix.dense()) @ P
+        np.testing.assert_allclose(coarser.dense(), expected, atol=1e-9)
+        back = level.restricted(jnp.eye(num * k).reshape(num, k, num * k), count)
+    np.testing.assert_allclose(np.asarray(back).reshape(count * k, -1), P.T, atol=1e-12)
