@@ -49,6 +49,8 @@ _STALE, _MOVED = 2, 0.3
 # Damping after the first refused step, and the least. There is none before: even 1e-9
 # of the diagonal holds back the bending of a long chain, so that steps converge slowly.
 _DAMPED = 1e-6
+# Share of a step that is tried last before it is damped.
+_SHORTEST = 1 / 8
 # Of the gain that ends the descent, what conjugate gradients may leave.
 _SPARED = 1e-4
 
@@ -170,8 +172,9 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         x, rounds = _tangents(
             matrix, of_edges.force, self.linear_solver or inverse, spared
         )
-        T, cost = _best_of_ways(problem, s.T, x, origin)
-        better = cost <= s.cost + _rounding(s.T, s.cost, of_edges)
+        enough = s.cost + _rounding(s.T, s.cost, of_edges)
+        T, cost = _far_enough(problem, s.T, x, origin, enough)
+        better = cost <= enough
         gain = jnp.where(
             s.cost > 0, (s.cost - cost) / jnp.where(s.cost > 0, s.cost, 1), 0
         )
@@ -215,6 +218,26 @@ def _rounding(T: Array, cost: Array, of_edges: Normal) -> Float[Array, ""]:
     place, force = lie.translation(T), of_edges.force[:, : T.shape[-1] - 1]
     far = jnp.sqrt(jnp.mean(jnp.sum(place**2, axis=-1)) * jnp.sum(force**2))
     return jnp.finfo(cost.dtype).eps * (ROUNDING * cost + far)
+
+
+def _far_enough(
+    problem: Problem, T: Array, x: Array, origin: Array, enough: Array
+) -> tuple[Float[Array, "v D D"], Float[Array, ""]]:
+    """Poses after a step or the first half of it, of that, ..., that costs enough less.
+
+    A damped step is solved for anew; of a million poses one takes a minute.
+    """
+
+    def at(share: Array) -> tuple[Array, Array, Array]:
+        return (*_best_of_ways(problem, T, share * x, origin), share)
+
+    def too_far(found: tuple[Array, Array, Array]) -> Array:
+        _, cost, share = found
+        return ~(cost <= enough) & (share > _SHORTEST)
+
+    whole = at(jnp.ones_like(enough))
+    T, cost, _ = control.while_loop(too_far, lambda found: at(found[2] / 2), whole)
+    return T, cost
 
 
 def _best_of_ways(
