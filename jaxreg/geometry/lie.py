@@ -116,7 +116,8 @@ def log_jacobian(tangent: Float[Array, "*b k"]) -> Float[Array, "*b k k"]:
     # ad / 2 + a ad^2 + b ad^4, and ad^4 = -sq ad^2 but for the corner of the velocity.
     a = jnp.where(wide, (slope - 2 * (h - 1)) / safe, 1 / 12 - sq**2 / 30240)
     b = jnp.where(wide, (slope - h + 1) / safe**2, -1 / 720 - sq / 15120)
-    a, eye, turn = a - b * sq, jnp.eye(d, dtype=tangent.dtype), hat(w)
+    a, turn = a - b * sq, hat(w)
+    eye = jnp.broadcast_to(jnp.eye(d, dtype=tangent.dtype), turn.shape)
     if d == 2:
         shift = jnp.stack([v[..., 1], -v[..., 0]], axis=-1)[..., None]
         corner = shift / 2 + a * product(turn, shift)
