@@ -68,7 +68,12 @@ def by_platform(cpu: Callable[[], Out], accelerator: Callable[[], Out]) -> Out:
     return cpu() if platform == "cpu" else accelerator()
 
 
-def once(function: Callable[..., Out], *operands: Array, true: Bool[Array, ""]) -> Out:
+def once(
+    function: Callable[..., Out],
+    *operands: Array,
+    true: Bool[Array, ""],
+    least: int = _MANY,
+) -> Out:
     """`function(*operands)` of many rows, written to memory before it is used.
 
     On a CPU, XLA computes it anew at each use instead: of products of 6 x 6 matrices
@@ -79,8 +84,9 @@ def once(function: Callable[..., Out], *operands: Array, true: Bool[Array, ""]) 
         function: of arrays.
         operands: its arguments; the first has a row for each of the many.
         true: always so, but the compiler must not know.
+        least: how many are many.
     """
-    if len(operands[0]) < _MANY:
+    if len(operands[0]) < least:
         return function(*operands)
 
     def never(*operands: Any) -> Any:

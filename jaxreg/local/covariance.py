@@ -10,7 +10,7 @@ from jaxreg._core.typing import Motion
 from jaxreg.linear.small import eigh
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.steps.base import full_matmul
-from jaxreg.matching.problem import Match, Problem, match, sum_rows
+from jaxreg.matching.problem import Match, Problem, inner, match
 from jaxreg.matching.residuals.gram import along
 
 
@@ -70,7 +70,7 @@ def pose_covariance(
     weight = optimiser.weights(found, width)
     H, _ = optimiser.residual.normal_equations(found, weight)
     pulls = optimiser.residual.descents(found) * weight[None]
-    pulls = jax.ops.segment_sum(pulls.T, found.row, problem.target.shape[0])
+    pulls = jax.ops.segment_sum(pulls.T, found.row, problem.target.shape[1])
     meat = full_matmul(pulls.T, pulls)
     A = answer(optimiser, problem, T_target_source, found, width, weight)
     inverse = inverse_within(A, H)
@@ -92,7 +92,7 @@ def answer(
     )
     # An interval of this half length; of matches without error, one above rounding.
     reach = jnp.maximum(jnp.sqrt(3 * variance), 1e-3 * width)
-    d, n = found.rotated.shape
+    d, n = found.source.shape
     every = max(1, n // _PROBES)
     few = problem.every(every)
     here = match(few, T_target_source, row=found.row[::every])
@@ -104,12 +104,12 @@ def answer(
         there = eqx.tree_at(lambda p: p.source, few, away)
         moved = match(there, T_target_source)
         weight = optimiser.weights(moved, width) * found.mask[::every]
-        return weight * sum_rows(normal * optimiser.residual.descents(moved)[:d])
+        return weight * inner(normal, optimiser.residual.descents(moved)[:d])
 
     sides = jnp.asarray([-1, 1], reach.dtype)
     before, behind = jax.vmap(pull)(sides)  # one search for both
     slope = (before - behind) / (2 * jnp.where(reach > 0, reach, 1))
-    slope = slope * jnp.sign(sum_rows(normal * here.normal))
+    slope = slope * jnp.sign(inner(normal, here.normal))
     by_source, by_target = along(normal, here)[:-1], along(here.normal, here)[:-1]
     A = full_matmul(by_source * slope[None], by_target.T)
     # As if all points had been asked, by the share of the weight of those that were.

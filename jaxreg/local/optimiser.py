@@ -1,9 +1,11 @@
 """One iteration of a local optimiser."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core import control
+from jaxreg._core.platforms import once
 from jaxreg._core.typing import Motion
 from jaxreg.local.steps import AbstractStep
 from jaxreg.matching.problem import Match, Problem, match
@@ -30,6 +32,8 @@ class LocalOptimiser(eqx.Module):
     ) -> Motion:
         """Weighs a match and steps."""
         weight = self.weights(found, width)
+        # Each row of the sums would divide anew.
+        weight = once(jnp.asarray, weight, true=width > -jnp.inf, least=0)
         return self.step(T_target_source, found, weight, self.residual)
 
     def weights(self, found: Match, width: Float[Array, ""]) -> Float[Array, " n"]:

@@ -53,9 +53,9 @@ def fit_scale(
     log_scale = jnp.where(free, descent / jnp.where(free, stiffness, 1), 0)
     growth = jnp.exp(jnp.clip(log_scale, -_MOST, _MOST))
     after = eqx.tree_at(
-        lambda m: (m.rotated, m.residual),
+        lambda m: (m.source, m.residual),
         found,
-        (growth * found.rotated, found.residual - (growth - 1) * found.rotated),
+        (growth * found.source, found.residual - (growth - 1) * found.rotated),
     )
     return growth, after
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxreg._core.typing import Scalar
 from jaxreg.cloud import PointCloud
-from jaxreg.matching.problem import Problem, match, sum_rows
+from jaxreg.matching.problem import Problem, match
 from jaxreg.neighbours import AbstractIndex
 
 
@@ -57,7 +57,7 @@ def near_by_chance(cloud: PointCloud, index: AbstractIndex) -> Scalar:
     found = match(Problem.of(room, cloud, index), jnp.eye(4, dtype=dtype))
     reach = jnp.maximum(spacing, cloud.spacing[found.row])
     over = jnp.abs(found.plane_residual)
-    along = sum_rows(found.residual**2) - over**2
+    along = found.sq_residual - over**2
     beside = flat & (along < reach**2) & (over < ZONE * reach)
     near = jnp.sum(beside & (over < reach)) / jnp.maximum(jnp.sum(beside), 1)
     beyond = jnp.clip((near - _OF_SCANS) / (1 - _OF_SCANS), 0, 1)

@@ -6,6 +6,8 @@ The source is centred at its own centroid, so that rotation and translation deco
 """
 
 import dataclasses
+import functools
+import operator
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,7 +27,7 @@ class Problem(eqx.Module):
         source: `(d, n)` points, centred.
         source_normals: `(d, n)` unit normals of either sign, zero where undefined.
         source_mask: `(n,)`.
-        target: `(m, 2d)` points and unit normals of either sign, side by side.
+        target: `(2d, m)` points and unit normals of either sign, one above the other.
         index: closest points among the target.
         seen: what the target's scanner saw, where its viewpoint is known.
         frames: those of the input, where they are known.
@@ -35,7 +37,7 @@ class Problem(eqx.Module):
     source: Float[Array, "d n"]
     source_normals: Float[Array, "d n"]
     source_mask: Bool[Array, " n"]
-    target: Float[Array, "m two_d"]
+    target: Float[Array, "two_d m"]
     index: AbstractIndex
     seen: RangeImage | None = None
     frames: Frames | None = None
@@ -54,7 +56,7 @@ class Problem(eqx.Module):
             source.points.T,
             source.normals.T,
             source.mask,
-            jnp.concatenate([target.points, target.normals], axis=1),
+            jnp.concatenate([target.points.T, target.normals.T]),
             index,
             target.seen,
             frames,
@@ -92,7 +94,8 @@ class Match(eqx.Module):
     """Source points under a pose beside their closest target points.
 
     Attributes:
-        rotated: `(d, n)` R p: the lever arms of the rotation.
+        source: `(d, n)` p, centred.
+        R: `(d, d)` rotation of the pose.
         residual: `(d, n)` q - (R p + t), from the moved source to the target.
         normal: `(d, n)` target normals.
         source_normal: `(d, n)` source normals, rotated with the pose of the match.
@@ -104,7 +107,8 @@ class Match(eqx.Module):
             the match was `moved`.
     """
 
-    rotated: Float[Array, "d n"]
+    source: Float[Array, "d n"]
+    R: Float[Array, "d d"]
     residual: Float[Array, "d n"]
     normal: Float[Array, "d n"]
     source_normal: Float[Array, "d n"]
@@ -114,14 +118,19 @@ class Match(eqx.Module):
     turn: Float[Array, "d d"]
 
     @property
+    def rotated(self) -> Float[Array, "d n"]:
+        """R p: the lever arms of the rotation."""
+        return rotate(self.R, self.source)
+
+    @property
     def sq_residual(self) -> Float[Array, " n"]:
         """Squared distance to the closest target point."""
-        return sum_rows(self.residual * self.residual)
+        return inner(self.residual, self.residual)
 
     @property
     def plane_residual(self) -> Float[Array, " n"]:
         """Signed distance to the target's tangent plane (line in 2D)."""
-        return sum_rows(self.normal * self.residual)
+        return inner(self.normal, self.residual)
 
     def within(self, distance: Scalar) -> "Match":
         """With the pairs that are farther apart masked."""
@@ -133,17 +142,20 @@ class Match(eqx.Module):
         )
 
 
-def sum_rows(x: Float[Array, "d n"]) -> Float[Array, " n"]:
-    """Sum over the d coordinates, unrolled: faster than a reduction of length 3."""
-    out = x[0]
-    for k in range(1, x.shape[0]):
-        out = out + x[k]
-    return out
+def inner(a: Float[Array, "d n"], b: Float[Array, "d n"]) -> Float[Array, " n"]:
+    """Inner products of columns, row by row: faster than a reduction of length 3."""
+    return functools.reduce(operator.add, (a[k] * b[k] for k in range(len(a))))
 
 
 def rotate(R: Float[Array, "d d"], columns: Float[Array, "d n"]) -> Float[Array, "d n"]:
     """R times columns, in full precision and unrolled."""
-    return jnp.stack([sum_rows(R[k][:, None] * columns) for k in range(R.shape[0])])
+    return jnp.stack(_rotated(R, columns))
+
+
+def _rotated(R: Float[Array, "d d"], columns: Array) -> list[Float[Array, " n"]]:
+    d = R.shape[0]
+    terms = [[R[i, j] * columns[j] for j in range(d)] for i in range(d)]
+    return [functools.reduce(operator.add, row) for row in terms]
 
 
 def match(
@@ -163,32 +175,31 @@ def match(
     """
     d = problem.source.shape[0]
     R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
-    rotated = rotate(R, problem.source)
-    moved = rotated + t[:, None]
+    # Row by row: XLA vectorises no loop over rows that were stacked before their use.
+    moved = [x + t[k] for k, x in enumerate(_rotated(R, problem.source))]
     if row is None:
-        row = problem.index.lookup(moved, num, coarse)
+        row = problem.index.lookup(jnp.stack(moved), num, coarse)
     if problem.soft is None or width is None:
-        found = problem.target[row]
+        found = [problem.target[k][row] for k in range(2 * d)]
     else:
-        found = problem.soft.blended(problem.target, moved, row, width)
-    normal = jnp.stack([found[:, d + k] for k in range(d)])
-    residual = jnp.stack([found[:, k] for k in range(d)]) - moved
-    source_normal = rotate(R, problem.source_normals)
-    cosine = sum_rows(source_normal * normal)
-    known = (sum_rows(normal * normal) > 0) & (
-        sum_rows(source_normal * source_normal) > 0
-    )
+        found = problem.soft.blended(problem.target, jnp.stack(moved), row, width)
+    residual = jnp.stack([found[k] - moved[k] for k in range(d)])
+    normal = jnp.stack([found[d + k] for k in range(d)])
+    cosine = inner(problem.source_normals, rotate(R.T, normal))
+    known = inner(normal, normal) > 0
+    known = known & jnp.any(problem.source_normals != 0, axis=0)
     agreement = jnp.where(known, cosine * cosine, 1)
     agreement = jnp.where(problem.source_mask, agreement, 0)
     return Match(
-        rotated,
+        problem.source,
+        R,
         residual,
         normal,
-        source_normal,
+        rotate(R, problem.source_normals),
         agreement,
         row,
         problem.source_mask,
-        turn=jnp.eye(d, dtype=moved.dtype),
+        turn=jnp.eye(d, dtype=t.dtype),
     )
 
 
@@ -209,6 +220,5 @@ def moved(match: Match, T_before: Motion, T_after: Motion) -> Match:
     shift = lie.translation(T_after) - lie.translation(T_before)
     rotated = rotate(turn, match.rotated)
     residual = match.residual - (rotated - match.rotated) - shift[:, None]
-    return eqx.tree_at(
-        lambda m: (m.rotated, m.residual, m.turn), match, (rotated, residual, turn)
-    )
+    R = jnp.sum(turn[:, :, None] * match.R[None], axis=1)
+    return eqx.tree_at(lambda m: (m.R, m.residual, m.turn), match, (R, residual, turn))

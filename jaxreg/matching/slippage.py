@@ -38,7 +38,8 @@ class Grip(eqx.Module):
     @classmethod
     def of(cls, found: Match, points: Float[Array, "d n"], share: Array) -> "Grip":
         """Of the points in `share`, where they are in the frame of the normals."""
-        found = eqx.tree_at(lambda m: m.rotated, found, points)
+        eye = jnp.eye(len(points), dtype=points.dtype)
+        found = eqx.tree_at(lambda m: (m.source, m.R), found, (points, eye))
         weight = share.astype(points.dtype)
         flat = jnp.any(found.normal != 0, axis=0)
         H, _ = PointToPlane(0.0).normal_equations(found, weight * flat)

@@ -83,21 +83,22 @@ class Surroundings(eqx.Module):
 
     def blended(
         self,
-        target: Float[Array, "m two_d"],
+        target: Float[Array, "two_d m"],
         moved: Float[Array, "d n"],
         row: Int[Array, " n"],
         width: Scalar,
-    ) -> Float[Array, "n two_d"]:
+    ) -> Float[Array, "two_d n"]:
         """The means of points and normals around those in `row`.
 
         Args:
-            target: points and normals, side by side.
+            target: points and normals, one above the other.
             moved: source points, in the target's frame.
             row: of the closest target points.
             width: of the kernel.
         """
         d = moved.shape[0]
         rows = self.near[row]
+        target = target.T
         found = target[rows]
         points, normals = found[..., :d], found[..., d:]
         sq = jnp.sum((points - moved.T[:, None]) ** 2, axis=-1)
@@ -108,7 +109,7 @@ class Surroundings(eqx.Module):
         sq = jnp.sum(normal**2, axis=1, keepdims=True)
         known = sq > 0
         normal = jnp.where(known, normal / jnp.sqrt(jnp.where(known, sq, 1)), 0)
-        return jnp.concatenate([jnp.sum(weight * points, axis=1), normal], axis=1)
+        return jnp.concatenate([jnp.sum(weight * points, axis=1), normal], axis=1).T
 
 
 def _fading(sq: Float[Array, "n k"], h: Scalar) -> Float[Array, "n k"]:

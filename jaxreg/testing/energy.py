@@ -93,10 +93,10 @@ def _matches(d: int) -> dict[str, Match]:
     plain, turned = noisy_match(d)[0], noisy_match(d, turn=motion(d, 0.9, 0.0, 5))[0]
     without = _joined(plain, valid=False)
     junk = eqx.tree_at(
-        lambda m: (m.rotated, m.residual),
+        lambda m: (m.source, m.residual),
         without,
         (
-            without.rotated.at[:, NUM_POINTS:].set(7.0),
+            without.source.at[:, NUM_POINTS:].set(7.0),
             without.residual.at[:, NUM_POINTS:].set(-9.0),
         ),
     )
@@ -123,7 +123,7 @@ def _joined(match: Match, *, valid: bool) -> Match:
         [jnp.ones_like(match.mask), jnp.full_like(match.mask, valid)]
     )
     return eqx.tree_at(
-        lambda m: (m.turn, m.mask, m.agreement),
+        lambda m: (m.R, m.turn, m.mask, m.agreement),
         twice,
-        (match.turn, twice.mask & keep, jnp.where(keep, twice.agreement, 0)),
+        (match.R, match.turn, twice.mask & keep, jnp.where(keep, twice.agreement, 0)),
     )

@@ -140,9 +140,9 @@ def _promise_descent(name: str, residual: AbstractResidual, d: int) -> None:
     )
     without = weight.at[0].set(0)
     far = eqx.tree_at(
-        lambda m: (m.rotated, m.residual),
+        lambda m: (m.source, m.residual),
         found,
-        (found.rotated.at[:, 0].set(7.0), found.residual.at[:, 0].set(-9.0)),
+        (found.source.at[:, 0].set(7.0), found.residual.at[:, 0].set(-9.0)),
     )
     promise_equal(
         _evaluate(residual, far, without)[:3],

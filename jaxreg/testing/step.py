@@ -92,13 +92,11 @@ def _problems(d: int) -> dict[str, _Held]:
     T_unit = T.copy()
     T_unit[:d, d] *= UNIT
 
-    def with_lengths(rotated: jax.Array, residual: jax.Array) -> Match:
-        return eqx.tree_at(
-            lambda m: (m.rotated, m.residual), plain, (rotated, residual)
-        )
+    def with_lengths(source: jax.Array, residual: jax.Array) -> Match:
+        return eqx.tree_at(lambda m: (m.source, m.residual), plain, (source, residual))
 
     junk = with_lengths(
-        plain.rotated.at[:, 0].set(7.0), plain.residual.at[:, 0].set(-9.0)
+        plain.source.at[:, 0].set(7.0), plain.residual.at[:, 0].set(-9.0)
     )
     return {
         "plain": (plain, T, weight),
@@ -109,7 +107,7 @@ def _problems(d: int) -> dict[str, _Held]:
         "alone": (plain, T, np.where(first, weight, 0)),
         "turned": (turned, T_turned, weight),
         "unit": (
-            with_lengths(UNIT * plain.rotated, UNIT * plain.residual),
+            with_lengths(UNIT * plain.source, UNIT * plain.residual),
             T_unit,
             weight,
         ),

@@ -111,14 +111,14 @@ def test_settings_are_followed(slopes):
 def test_means_do_not_jump_where_the_closest_point_changes(width, height):
     points = jnp.asarray(problems.surface(400, 3, 0))
     around = jr.SoftMatches().among(points, jnp.ones(len(points), bool))
-    target = jnp.concatenate([points, jnp.zeros_like(points)], axis=1)
+    target = jnp.concatenate([points.T, jnp.zeros_like(points.T)])
     # From one sample along the surface to its 30th neighbour, or beside it.
     end = points[jnp.argsort(jnp.sum((points - points[0]) ** 2, axis=1))[30]]
     way = points[0] + jnp.linspace(0, 1, 4001)[:, None] * (end - points[0])
     way = way + height * points[0] / jnp.linalg.norm(points[0])
     row = jnp.argmin(jnp.sum((way[:, None] - points) ** 2, axis=-1), axis=1)
     assert len(np.unique(row)) > 3
-    means = around.blended(target, way.T, row, jnp.asarray(width))[:, :3]
+    means = around.blended(target, way.T, row, jnp.asarray(width))[:3].T
     steps = jnp.linalg.norm(jnp.diff(means, axis=0), axis=1)
     assert float(steps.max()) < 5 * float(jnp.median(steps))
 
@@ -127,7 +127,7 @@ def test_few_points_and_points_that_coincide_leave_numbers():
     points = jnp.asarray(np.repeat(problems.surface(3, 3, 0), 4, axis=0))
     mask = jnp.arange(12) < 11
     around = jr.SoftMatches().among(points, mask)
-    target = jnp.concatenate([points, points], axis=1)
+    target = jnp.concatenate([points.T, points.T])
     row = jnp.arange(11)
 
     def total(moved: jax.Array) -> jax.Array:

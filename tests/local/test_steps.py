@@ -55,7 +55,7 @@ def _energy(residual, found, weight, T_before, T_after):
 @in_2d_and_3d
 def test_steps_find_the_closed_form_with_matches_held(d):
     problem, start, weight = noisy_problem(d, np.float32)
-    expected = kabsch(problem.source.T, problem.target[:, :d], weight)
+    expected = kabsch(problem.source.T, problem.target[:d].T, weight)
     for step in [ClosedForm(), *ITERATIVE]:
         T = start
         for _ in range(1 if isinstance(step, ClosedForm) else 12):
@@ -80,7 +80,7 @@ def test_units_do_not_matter(step):
         problem,
         (
             1000 * problem.source,
-            problem.target * np.repeat(np.array([1000, 1], np.float32), 3),
+            problem.target * np.repeat([[1000], [1]], 3, axis=0).astype(np.float32),
         ),
     )
     T_mm = T.at[:3, 3].multiply(1000)
@@ -110,7 +110,7 @@ def test_levenberg_marquardt_never_raises_the_held_energy(residual):
 
 def test_levenberg_marquardt_stays_at_the_minimum_and_keeps_the_gradient():
     problem, _, weight = noisy_problem(2, np.float32)
-    T = kabsch(problem.source.T, problem.target[:, :2], weight)
+    T = kabsch(problem.source.T, problem.target[:2].T, weight)
     found = found_at(problem, T)
     push = jnp.ones_like(found.residual).at[1].set(jnp.arange(N) / N)
 
@@ -133,7 +133,7 @@ def test_levenberg_marquardt_stays_at_the_minimum_and_keeps_the_gradient():
 def _flat(problem):
     """The problem with both clouds in the plane z = 0, 0.1 apart, normals along z."""
     up = jnp.zeros_like(problem.source_normals).at[2].set(1)
-    target = jnp.concatenate([problem.source.at[2].set(0.1), up]).T
+    target = jnp.concatenate([problem.source.at[2].set(0.1), up])
     return eqx.tree_at(
         lambda p: (p.source, p.source_normals, p.target),
         problem,
@@ -164,7 +164,7 @@ def test_one_point_and_a_line_give_finite_steps_that_fit(step):
     collinear = eqx.tree_at(
         lambda p: (p.source, p.target),
         problem,
-        (line, problem.target.at[:, :3].set(line.T + 0.1)),
+        (line, problem.target.at[:3].set(line + 0.1)),
     )
     for posed, chosen in ((problem, one), (collinear, weight)):
         found = found_at(posed, T)
@@ -224,10 +224,8 @@ def test_condition_tells_what_the_data_leave_free():
         return condition(points, radius), condition(plane, radius)
 
     def of(points):
-        normals = jnp.concatenate([points, normals_of(points)], axis=1)
-        posed = eqx.tree_at(
-            lambda p: (p.source, p.target), problem, (points.T, normals)
-        )
+        target = jnp.concatenate([points.T, normals_of(points).T])
+        posed = eqx.tree_at(lambda p: (p.source, p.target), problem, (points.T, target))
         return [float(x) for x in conditions(found_at(posed, T))]
 
     shape = blob(N, 3)

@@ -31,7 +31,7 @@ def _gicp_metric(problem, T):
     """(C_q + R C_p R^T)^-1 of every point, by inversion in NumPy."""
     d = problem.source.shape[0]
     R = np.asarray(T)[:d, :d]
-    q = np.asarray(problem.target)[:, d:]
+    q = np.asarray(problem.target[d:]).T
     p = np.asarray(problem.source_normals).T
     eye = np.eye(d)
     C_q = eye - (1 - EPSILON) * np.einsum("ni,nj->nij", q, q)
@@ -45,7 +45,7 @@ def _stacked(residual, problem, T):
     Written from the papers, without the package's moments and lever arms.
     """
     d = problem.source.shape[0]
-    q, n_q = problem.target[:, :d], problem.target[:, d:]
+    q, n_q = problem.target[:d].T, problem.target[d:].T
     p, n_p = problem.source.T, problem.source_normals.T
     root = jnp.linalg.cholesky(jnp.asarray(_gicp_metric(problem, T)))
     sign = jnp.sign(jnp.sum((n_p @ T[:d, :d].T) * n_q, axis=1, keepdims=True))
@@ -175,9 +175,9 @@ def test_the_symmetric_residual_vanishes_for_two_points_of_one_circle():
     found = found_at(problem, T)
     p, q = (jnp.asarray(x.T, jnp.float32) for x in (p, q))
     found = eqx.tree_at(
-        lambda m: (m.rotated, m.residual, m.source_normal, m.normal),
+        lambda m: (m.source, m.R, m.residual, m.source_normal, m.normal),
         found,
-        (p, q - p, p, q),
+        (p, jnp.eye(2, dtype=p.dtype), q - p, p, q),
     )
     assert float(_energy(Symmetric(), found, weight)) < 1e-10
     assert float(_energy(PointToPlane(0.0), found, weight)) > 1e-2

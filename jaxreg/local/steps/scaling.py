@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg.linear.small import eigh, solve_semidefinite
-from jaxreg.matching.problem import Match, sum_rows
+from jaxreg.matching.problem import Match, inner
 from jaxreg.matching.residuals.gram import half_sum
 
 
@@ -38,7 +38,7 @@ class Scaled(eqx.Module):
         weight: Float[Array, " n"],
     ) -> "Scaled":
         """Divides translation by its stiffness and rotation by the gyration too."""
-        d = match.rotated.shape[0]
+        d = match.source.shape[0]
         radius = gyration_radius(match, weight)
         stiffness = jnp.trace(H[:d, :d]) / d
         turn = jnp.where(radius > 0, 1 / jnp.where(radius > 0, radius, 1), 1)
@@ -66,9 +66,9 @@ def gyration_radius(match: Match, weight: Float[Array, " n"]) -> Float[Array, ""
     The mean is taken over the d axes as well; in the unit of the points. Zero where
     all weights are.
     """
-    d = match.rotated.shape[0]
+    d = match.source.shape[0]
     total = jnp.sum(weight)
-    square = 2 * half_sum(sum_rows(match.rotated * match.rotated), weight)
+    square = 2 * half_sum(inner(match.source, match.source), weight)
     share = 1 if d == 2 else 2 / 3
     mean = share * square / jnp.where(total > 0, total, 1)
     return jnp.sqrt(jnp.where(mean > 0, mean, 1)) * (mean > 0)

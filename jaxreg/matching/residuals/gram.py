@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxreg.matching.problem import Match, sum_rows
+from jaxreg.matching.problem import Match, inner
 
 
 class Moments(eqx.Module):
@@ -56,7 +56,7 @@ def along(direction: Float[Array, "d n"], match: Match) -> Float[Array, "k1 n"]:
     Their Gram matrix holds H, and b in its last column.
     """
     turn = cross(match.rotated, direction)
-    return jnp.stack([*direction, *turn, sum_rows(direction * match.residual)])
+    return jnp.stack([*direction, *turn, inner(direction, match.residual)])
 
 
 def wrench(force: Float[Array, "d n"], match: Match) -> Float[Array, "k n"]:

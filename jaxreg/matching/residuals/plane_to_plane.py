@@ -7,10 +7,10 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_positive
-from jaxreg.matching.problem import Match, sum_rows
+from jaxreg.matching.problem import Match, inner, rotate
 from jaxreg.matching.residuals.base import AbstractResidual
-from jaxreg.matching.residuals.gram import along, half_sum, weighted_gram, wrench
-from jaxreg.matching.residuals.point_to_point import PointToPoint
+from jaxreg.matching.residuals.gram import half_sum, wrench
+from jaxreg.matching.residuals.metric import identity, metric_equations, outer
 
 
 class PlaneToPlane(AbstractResidual):
@@ -44,27 +44,23 @@ class PlaneToPlane(AbstractResidual):
     def normal_equations(
         self, match: Match, weight: Float[Array, " n"]
     ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
-        """Half of point-to-point plus the residuals along s and a."""
-        H, b = PointToPoint().normal_equations(match, weight)
-        H, b = H / 2, b / 2
-        for direction, stiffness in self._axes(match):
-            gram = weighted_gram(along(direction, match), weight * stiffness)
-            H, b = H + gram[:-1, :-1], b + gram[:-1, -1]
-        return H, b
+        """Of the metric M."""
+        axes = self._axes(match)
+        metric = [0.5 * x for x in identity(len(match.residual))]
+        for direction, stiffness in axes:
+            planes = outer(rotate(match.R.T, direction))
+            metric = [m + stiffness * x for m, x in zip(metric, planes, strict=True)]
+        return metric_equations(match, weight, metric, list(_force(match, axes)))
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
         """The wrench of M r."""
-        force = match.residual / 2
-        for direction, stiffness in self._axes(match):
-            along_it = stiffness * sum_rows(direction * match.residual)
-            force = force + along_it[None] * direction
-        return wrench(force, match)
+        return wrench(_force(match, self._axes(match)), match)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w r^T M r / 2."""
         sq = match.sq_residual / 2
         for direction, stiffness in self._axes(match):
-            sq = sq + stiffness * sum_rows(direction * match.residual) ** 2
+            sq = sq + stiffness * inner(direction, match.residual) ** 2
         return half_sum(sq, weight)
 
     def _axes(self, match: Match) -> list[tuple[Array, Array]]:
@@ -73,8 +69,17 @@ class PlaneToPlane(AbstractResidual):
         p = jnp.where(jnp.any(p != 0, axis=0, keepdims=True), p, q)
         q = jnp.where(jnp.any(q != 0, axis=0, keepdims=True), q, p)
         c = 1 - jnp.asarray(self.epsilon, q.dtype)
-        cosine = sum_rows(p * q)
+        cosine = inner(p, q)
         return [
             (q + p, c / 4 / (2 - c * (1 + cosine))),
             (q - p, c / 4 / (2 - c * (1 - cosine))),
         ]
+
+
+def _force(match: Match, axes: list[tuple[Array, Array]]) -> Float[Array, "d n"]:
+    """M r."""
+    force = match.residual / 2
+    for direction, stiffness in axes:
+        along_it = stiffness * inner(direction, match.residual)
+        force = force + along_it[None] * direction
+    return force

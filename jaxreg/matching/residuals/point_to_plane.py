@@ -7,10 +7,10 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_not_negative
-from jaxreg.matching.problem import Match
+from jaxreg.matching.problem import Match, rotate
 from jaxreg.matching.residuals.base import AbstractResidual
-from jaxreg.matching.residuals.gram import along, half_sum, weighted_gram, wrench
-from jaxreg.matching.residuals.point_to_point import PointToPoint
+from jaxreg.matching.residuals.gram import half_sum, wrench
+from jaxreg.matching.residuals.metric import identity, metric_equations, outer
 
 
 class PointToPlane(AbstractResidual):
@@ -33,21 +33,24 @@ class PointToPlane(AbstractResidual):
     def normal_equations(
         self, match: Match, weight: Float[Array, " n"]
     ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
-        """The Gram matrix of rows (n, x cross n, n . r), plus the share of points."""
-        rows = along(match.normal, match)
-        gram = weighted_gram(rows, weight)
-        H, b = PointToPoint().normal_equations(match, weight)
-        share = jnp.asarray(self.point_share, H.dtype)
-        return gram[:-1, :-1] + share * H, gram[:-1, -1] + share * b
+        """Of the metric n n^T + point_share I."""
+        share = jnp.asarray(self.point_share, weight.dtype)
+        normal = rotate(match.R.T, match.normal)
+        planes = zip(outer(normal), identity(len(normal)), strict=True)
+        metric = [plane + share * point for plane, point in planes]
+        return metric_equations(match, weight, metric, self._force(match))
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
         """The wrench of (n . r) n plus the share of r."""
-        r = match.residual
-        share = jnp.asarray(self.point_share, r.dtype)
-        return wrench(match.plane_residual[None] * match.normal + share * r, match)
+        return wrench(jnp.stack(self._force(match)), match)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w ((n . r)^2 + point_share |r|^2) / 2."""
         share = jnp.asarray(self.point_share, weight.dtype)
         plane = match.plane_residual
         return half_sum(plane * plane + share * match.sq_residual, weight)
+
+    def _force(self, match: Match) -> list[Float[Array, " n"]]:
+        n, r, height = match.normal, match.residual, match.plane_residual
+        share = jnp.asarray(self.point_share, r.dtype)
+        return [height * n[k] + share * r[k] for k in range(len(r))]

@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxreg.matching.problem import Match, rotate, sum_rows
+from jaxreg.matching.problem import Match, inner, rotate
 from jaxreg.matching.residuals.base import AbstractResidual
 from jaxreg.matching.residuals.gram import cross, half_sum, weighted_gram
 
@@ -44,19 +44,19 @@ class Symmetric(AbstractResidual):
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w ((n_p + n_q) . r)^2 / 2."""
-        height = sum_rows(_normal_sum(match) * match.residual)
+        height = inner(_normal_sum(match), match.residual)
         return half_sum(height * height, weight)
 
 
 def _rows(match: Match) -> Float[Array, "k1 n"]:
     p, n, r = _source_normal(match), _normal_sum(match), match.residual
     turn = [a + b for a, b in zip(cross(match.rotated, n), cross(r, p), strict=True)]
-    return jnp.stack([*n, *turn, sum_rows(n * r)])
+    return jnp.stack([*n, *turn, inner(n, r)])
 
 
 def _source_normal(match: Match) -> Float[Array, "d n"]:
     """The source normals at the present pose, with the sign nearer to the target's."""
-    sign = jnp.where(sum_rows(match.source_normal * match.normal) < 0, -1, 1)
+    sign = jnp.where(inner(match.source_normal, match.normal) < 0, -1, 1)
     sign = sign.astype(match.normal.dtype)[None]
     return sign * rotate(match.turn, match.source_normal)
 

@@ -1,0 +1,88 @@
+"""Normal equations of residuals with a metric: the energy sum of w r^T M r / 2.
+
+They are summed in the frame of the source. There products of coordinates are the same
+for all poses, so that the sums of many particles are one matrix product, which takes a
+quarter of the time of one for each particle.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxreg.matching.problem import Match
+
+
+def metric_equations(
+    match: Match,
+    weight: Float[Array, " n"],
+    metric: Sequence[Float[Array, " n"]],
+    force: Sequence[Float[Array, " n"]],
+) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
+    """H and b for the tangent (v, w), see `AbstractResidual`.
+
+    Args:
+        match: the points.
+        weight: of each.
+        metric: the upper triangle of M row by row, in the frame of the source.
+        force: M r row by row, in the frame of the target.
+    """
+    p, R = match.source, match.R
+    d, number = len(p), len(metric)
+    products = [a * b for a, b in _each_two([jnp.ones_like(p[0]), *p])]
+    rows = jnp.stack([weight * x for x in (*metric, *force)])
+    sums = _product(rows, jnp.stack(products).T)
+    # Sums of M_ij p_b p_c with 1 as p_0, at row (i, b) and column (j, c).
+    spread = sums[:number][_places(d)][..., _places(d + 1)]
+    spread = jnp.swapaxes(spread, 1, 2).reshape(d * (d + 1), -1)
+    pull = _product(R.T, sums[number:, : d + 1]).reshape(-1, 1)
+    K = _turned(R, jnp.asarray(_tangents(d), weight.dtype))
+    return _product(_product(K, spread), K.T), _product(K, pull)[:, 0]
+
+
+def outer(rows: Float[Array, "d n"]) -> list[Float[Array, " n"]]:
+    """The upper triangle of each column's product with itself, row by row."""
+    return [a * b for a, b in _each_two(list(rows))]
+
+
+def identity(d: int) -> list[float]:
+    """The upper triangle of the identity, row by row."""
+    return [float(a == b) for a, b in _each_two(range(d))]
+
+
+def _each_two(rows: Sequence[Any]) -> list[tuple[Any, Any]]:
+    """Each with itself and with those behind it: an upper triangle row by row."""
+    return list(itertools.combinations_with_replacement(rows, 2))
+
+
+def _places(num: int) -> np.ndarray:
+    """Where each entry of a symmetric matrix is in its upper triangle."""
+    places = np.zeros((num, num), int)
+    for at, (i, j) in enumerate(_each_two(range(num))):
+        places[i, j] = places[j, i] = at
+    return places
+
+
+def _tangents(d: int) -> np.ndarray:
+    """`(k, d (d + 1))` K with (n, p cross n) = K vec(n outer (1, p))."""
+    one, *axes = np.eye(d + 1)
+    units = np.eye(d)
+    turns = [(0, 1)] if d == 2 else [(1, 2), (2, 0), (0, 1)]
+    rows = [np.kron(n, one) for n in units]
+    rows += [np.kron(units[c], axes[b]) - np.kron(units[b], axes[c]) for b, c in turns]
+    return np.stack(rows)
+
+
+def _turned(R: Float[Array, "d d"], K: Float[Array, "k m"]) -> Float[Array, "k m"]:
+    """Tangents of the source's frame as those of the target's."""
+    d = len(R)
+    turn = _product(R, K[d:]) if d == 3 else K[d:]
+    return jnp.concatenate([_product(R, K[:d]), turn])
+
+
+def _product(a: Float[Array, "i j"], b: Float[Array, "j l"]) -> Float[Array, "i l"]:
+    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
