@@ -1,5 +1,6 @@
 """Point clouds: thinned, described and measured inside `jit`."""
 
+from jaxreg.cloud.described import Described as Described
 from jaxreg.cloud.frames import OTHER_UNIT as OTHER_UNIT
 from jaxreg.cloud.frames import Frames as Frames
 from jaxreg.cloud.frames import Side as Side

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.arrays import spread_rows
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Mask, Points
+from jaxreg.cloud.described import Described
 from jaxreg.cloud.normals import Windows
 from jaxreg.cloud.range_image import RangeImage
 from jaxreg.neighbours import BruteForce, Neighbours
@@ -27,6 +28,7 @@ class PointCloud(BriefModule):
             there are no more.
         judged: the same surface with as many points as poses are judged by; None if
             these are as many.
+        described: some of the points with local features, where they are known.
         window: what the normals were taken from, until they are `followed`.
     """
 
@@ -37,6 +39,7 @@ class PointCloud(BriefModule):
     spacing: Float[Array, " n"] | None = None
     fine: "PointCloud | None" = None
     judged: "PointCloud | None" = None
+    described: Described | None = None
     window: Windows | None = None
 
     def followed(self) -> "PointCloud":

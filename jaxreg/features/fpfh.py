@@ -21,13 +21,12 @@ Registration, ICRA 2009.
 
 import math
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Scalar
-from jaxreg.cloud import PointCloud
+from jaxreg.cloud import Described, PointCloud
 from jaxreg.neighbours import BruteForce
 
 
@@ -35,24 +34,6 @@ from jaxreg.neighbours import BruteForce
 _BINS = 11
 # A feature of fewer neighbours is none.
 _LEAST = 5
-
-
-class Described(eqx.Module):
-    """Points with features.
-
-    Attributes:
-        points: `(n, 3)`.
-        normals: `(n, 3)` of either sign.
-        even: `(n, 33)` the part of the feature that the normal's sign leaves.
-        odd: `(n, 33)` the part that changes its sign with the normal's.
-        mask: which have a feature: those with a normal, and neighbours with normals.
-    """
-
-    points: Float[Array, "n 3"]
-    normals: Float[Array, "n 3"]
-    even: Float[Array, "n f"]
-    odd: Float[Array, "n f"]
-    mask: Bool[Array, " n"]
 
 
 def described(cloud: PointCloud, radius: Scalar, num_neighbours: int) -> Described:

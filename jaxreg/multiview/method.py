@@ -1,10 +1,14 @@
 """What the pipeline asks of a method of registration, beyond its contract."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from jaxreg._core.typing import Key, Motion, Scalar
 from jaxreg.cloud import PointCloud
+from jaxreg.features import features_of
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import LIKELY, PointToPlane
 from jaxreg.neighbours import AbstractIndex, VoxelTable
@@ -43,6 +47,25 @@ def index_of(method: AbstractRegistrar, cloud: PointCloud) -> AbstractIndex:
     if isinstance(method, AbstractIndexedRegistrar):
         return method.index_of(cloud)
     return VoxelTable.build(cloud.points, cloud.mask)
+
+
+def with_features(
+    method: AbstractRegistrar, cloud: PointCloud, spacing: Scalar
+) -> PointCloud:
+    """With the local features that the search of its pairs asks for, if it does.
+
+    Args:
+        method: of registration.
+        cloud: a prepared scan.
+        spacing: between samples of the coarser scans.
+    """
+    d = cloud.points.shape[1]
+    if not (isinstance(method, AbstractSearch) and method.proposes(d)):
+        return cloud
+    described = lax.stop_gradient(features_of(cloud.as_judged, spacing))
+    if cloud.judged is None:
+        return replace(cloud, described=described)
+    return replace(cloud, judged=replace(cloud.judged, described=described))
 
 
 def solve(

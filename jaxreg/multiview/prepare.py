@@ -21,14 +21,14 @@ from jaxreg.cloud import (
 )
 from jaxreg.geometry import lie
 from jaxreg.matching import Problem, Witness
-from jaxreg.multiview.method import index_of
+from jaxreg.multiview.method import index_of, with_features
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.neighbours import AbstractIndex, exact_index, index_within
 from jaxreg.registrar import AbstractRegistrar
 
 
-# Scans whose tables are held, a megabyte each; of more they are made when needed, 10 ms
-# each, where the search of a pair takes 200.
+# Scans whose tables and features are held, a megabyte and half of one each; of more
+# they are made when needed, 10 and 35 ms each, where the search of a pair takes 200.
 _MOST_TABLES = 512
 
 
@@ -37,7 +37,8 @@ class PreparedScans(eqx.Module):
 
     Attributes:
         clouds: `(v, n, d)` thinned points with normals; the unit is `radius`. With what
-            was seen from the viewpoints, where these are given.
+            was seen from the viewpoints, where these are given, and with local features
+            where many pairs are to be searched.
         tables: their indexes, of the method's kind; None of very many scans.
         exact: indexes that miss no near point, for the evidence.
         mean: `(v, d)` centroid of each scan in its input frame.
@@ -169,8 +170,10 @@ def prepare_scan(
     radius: Scalar,
     *,
     with_table: bool,
-) -> tuple[PointCloud, AbstractIndex | None, AbstractIndex, Float[Array, " d"], Scalar]:
-    """One scan: cloud, table, exact index, centroid and spacing."""
+) -> tuple[
+    PointCloud, AbstractIndex | None, AbstractIndex, Float[Array, " d"], Scalar, Scalar
+]:
+    """One scan: cloud, table, exact index, centroid, spacing and that as judged."""
     mean = centroid(points, mask)
     method = method.in_frames(Frames(mean, mean, radius))
     centred = (points - mean[None]) / radius
@@ -181,7 +184,7 @@ def prepare_scan(
         within = median_spacing(judged.points, judged.mask)
     exact = index_within(judged.points, judged.mask, within)
     table = index_of(method, cloud) if with_table else None
-    return cloud, table, exact, mean, spacing
+    return cloud, table, exact, mean, spacing, within
 
 
 @kept_program
@@ -193,11 +196,21 @@ def prepare_scans(
     positions: ScanPositions | None = None,
     *,
     side_by_side: bool = False,
+    to_search: bool = False,
 ) -> PreparedScans:
     """Prepares all scans, one after another; NaN stands for an unknown viewpoint.
 
     Side by side their derivatives are right under `vmap`, too: in a loop JAX leaves the
     rules for them out, and what it takes instead is not a number.
+
+    Args:
+        method: of registration.
+        points: of the scans.
+        mask: which of them are valid.
+        viewpoints: where the scanners stood, or None.
+        positions: likewise, in the world.
+        side_by_side: whether under `vmap` rather than in a loop.
+        to_search: whether most pairs are searched for, so that local features pay.
     """
     points, mask, dropped = clean(points, mask)
     radius = common_radius(points, mask)
@@ -207,14 +220,24 @@ def prepare_scans(
         return prepare_scan(method, *scan, radius, with_table=held)
 
     every = jax.vmap(one) if side_by_side else partial(lax.map, one)
-    clouds, tables, exact, mean, spacing = every((points, mask))
+    clouds, tables, exact, mean, spacing, judged = every((points, mask))
     if viewpoints is not None:
         eyes = (viewpoints - mean) / radius
         clouds = lax.map(lambda scan: scan[0].seen_from(scan[1]), (clouds, eyes))
+    if to_search and len(points) <= _MOST_TABLES:
+        common = _common_spacing(judged)
+        clouds = lax.map(lambda cloud: with_features(method, cloud, common), clouds)
     fault = _fault(clouds, jax.vmap(rms_radius)(points, mask) / radius, spacing)
     return PreparedScans(
         clouds, tables, exact, mean, radius, spacing, fault, dropped, positions
     )
+
+
+def _common_spacing(spacing: Float[Array, " v"]) -> Scalar:
+    """The coarsest, at most twice the middle one: a scan may be a few dots."""
+    known = jnp.where(spacing > 0, spacing, jnp.nan)
+    coarsest = jnp.minimum(jnp.nanmax(known), 2 * jnp.nanmedian(known))
+    return jnp.nan_to_num(coarsest)
 
 
 def _fault(

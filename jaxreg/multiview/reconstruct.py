@@ -209,7 +209,8 @@ def _of_chosen_pairs(
             progress(stage, done, total)
 
     report("preparing scans", 0, 1)
-    prepared = jax.block_until_ready(prepare_scans(method, *inputs))
+    prepared = prepare_scans(method, *inputs, to_search=order == "any")
+    prepared = jax.block_until_ready(prepared)
     report("preparing scans", 1, 1)
     before, first = _known(previous, prepared, order)
     hold = None
@@ -240,7 +241,7 @@ def _of_all_pairs(
     known: KnownWorld | None,
 ) -> ReconstructionSolution:
     """What can be traced: no pair is chosen by what others told."""
-    prepared = prepare_scans(method, *inputs, side_by_side=True)
+    prepared = prepare_scans(method, *inputs, side_by_side=True, to_search=True)
     pairs = jax.device_put(all_pairs(prepared.num_scans))
     method, held = jax.lax.stop_gradient((method, prepared))
     motions = relative_motions(method, held, pairs, key)

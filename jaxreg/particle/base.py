@@ -201,15 +201,16 @@ class AbstractSearch(AbstractIndexedRegistrar):
         )
         return dataclasses.replace(solution, trace=found.trace)
 
+    def proposes(self, d: int) -> bool:
+        """Whether local features are looked at where no guess is given."""
+        anywhere = self.prior is None or isinstance(self.prior, PartialPose)
+        return self.num_proposals > 0 and anywhere and self.refine_steps > 0 and d == 3
+
     def _proposals(
         self, pair: Pair, sure: Bool[Array, ""], init: Motion | None
     ) -> tuple[Float[Array, "r 4 4"], Bool[Array, " r"]] | None:
         """Poses of local features and which are in use, where any may be the answer."""
-        anywhere = init is None and (
-            self.prior is None or isinstance(self.prior, PartialPose)
-        )
-        judged = self.refine_steps > 0 and pair.source.points.shape[1] == 3
-        if not (self.num_proposals and anywhere and judged):
+        if init is not None or not self.proposes(pair.source.points.shape[1]):
             return None
         pair = pair.judged
         return propose_modes(

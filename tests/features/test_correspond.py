@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxreg.features import Described, mutual
+from jaxreg.cloud import Described
+from jaxreg.features import mutual
 
 
 def random_features(n: int, seed: int) -> Described:

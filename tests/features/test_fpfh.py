@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxreg.cloud import PointCloud
-from jaxreg.features import Described, described
+from jaxreg.cloud import Described, PointCloud
+from jaxreg.features import described
 
 
 RADIUS, NEIGHBOURS, BINS = 0.5, 24, 11

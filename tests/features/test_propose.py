@@ -11,8 +11,9 @@ from jaxreg.cloud import PointCloud, thin
 from jaxreg.datasets import sculpture_scans
 from jaxreg.features import Agreed, propose
 from jaxreg.geometry import lie
+from jaxreg.multiview.method import with_features
 from jaxreg.neighbours import BruteForce
-from jaxreg.particle import UniformPrior
+from jaxreg.particle import UniformPrior, sandhu2010
 from jaxreg.particle.pair import Pair
 from jaxreg.particle.proposals import propose_modes
 
@@ -68,6 +69,19 @@ def test_the_most_agreed_pose_is_right(clouds):
     assert shift < 3 * spacing
     assert used[0]
     np.testing.assert_array_equal(T[0], best)
+
+
+def test_clouds_described_before_propose_the_same(clouds):
+    source, target, _, spacing = clouds
+    ready = [
+        with_features(jr.ParticleFilter(), cloud, spacing) for cloud in (source, target)
+    ]
+    wanted = propose(source, target, spacing)
+    found = propose(*ready, spacing)
+    np.testing.assert_array_equal(found.num_agreeing, wanted.num_agreeing)
+    np.testing.assert_array_equal(found.T_target_source, wanted.T_target_source)
+    for method in (jr.ICP(), jr.ParticleFilter(num_proposals=0), sandhu2010(3)):
+        assert with_features(method, source, spacing).described is None
 
 
 def test_modes_are_distinct_and_only_where_wanted(clouds):

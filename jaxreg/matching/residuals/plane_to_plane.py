@@ -46,10 +46,12 @@ class PlaneToPlane(AbstractResidual):
     ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
         """Of the metric M."""
         axes = self._axes(match)
-        metric = [0.5 * x for x in identity(len(match.residual))]
-        for direction, stiffness in axes:
-            planes = outer(rotate(match.R.T, direction))
-            metric = [m + stiffness * x for m, x in zip(metric, planes, strict=True)]
+        planes = (
+            [stiffness * x for x in outer(rotate(match.R.T, direction))]
+            for direction, stiffness in axes
+        )
+        points = identity(len(match.residual))
+        metric = [x / 2 + s + a for x, s, a in zip(points, *planes, strict=True)]
         return metric_equations(match, weight, metric, list(_force(match, axes)))
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
