@@ -12,6 +12,7 @@ import numpy as np
 
 import jaxreg
 from jaxreg._core.checks import as_host_array
+from jaxreg.app.plot.chained import chained
 from jaxreg.app.plot.figure import draw_reconstruction
 from jaxreg.app.plot.graph import draw_graph
 from jaxreg.app.plot.report import write_report
@@ -55,7 +56,7 @@ def draw(solution: Solution, *data: Any, names: Sequence[str] | None = None) -> 
     _require_one(solution)
     if isinstance(solution, jaxreg.AveragingSolution):
         graph = _graph(data)
-        before = jaxreg.average(graph, jaxreg.ShortestPaths())
+        before = chained(graph, solution)
         return draw_graph(
             np.asarray(graph.edges)[np.asarray(graph.mask)],
             np.asarray(before.T_world_i, np.float64),

@@ -24,6 +24,7 @@ from jaxreg.app.cli.options import Average
 from jaxreg.app.cli.runtime import Session, key_of
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_graph, save_figure, write_graph_report
+from jaxreg.app.plot.chained import chained
 from jaxreg.app.plot.results import MAX_COVARIANCES
 from jaxreg.app.result import RESULT_FORMAT, write_json
 from jaxreg.app.versions import versions
@@ -32,7 +33,6 @@ from jaxreg.averaging import (
     Correntropy,
     EdgeReport,
     MotionAveraging,
-    ShortestPaths,
     WeightedMotionAveraging,
     average,
     edge_report,
@@ -76,14 +76,13 @@ def run(command: Average, session: Session) -> int:
         session.console.print(message)
     key = key_of(command)
     with session.progress() as progress, session.timed("run", computes=True):
-        progress("averaging", 0, 2)
-        before = average(graph, method=ShortestPaths())
-        progress("averaging", 1, 2)
+        progress("averaging", 0, 1)
         sol = average(graph, method=method, key=key, **known._asdict())
         if right.any():
             sol = forced(graph, sol, right, known._asdict())
         jax.block_until_ready(sol)
-        progress("averaging", 2, 2)
+        progress("averaging", 1, 1)
+    before = chained(graph, sol)
     if is_told(known):
         before = _beside(before, sol)
     objective = [float(chordal_objective(graph, s.T_world_i)) for s in (before, sol)]
@@ -229,7 +228,7 @@ def _show(
     table = Table(title=f"{graph.num_poses} poses, {num_edges} edges")
     table.add_column("poses")
     table.add_column("objective", justify="right")
-    table.add_row("before (spanning tree)", f"{objective[0]:.8g}")
+    table.add_row("before (along a tree)", f"{objective[0]:.8g}")
     table.add_row("after", f"{objective[1]:.8g}")
     session.console.print(table)
     placed = np.asarray(sol.placed)

@@ -8,6 +8,7 @@ import numpy as np
 
 import jaxreg
 from jaxreg._core.status import Status
+from jaxreg.app.plot.chained import chained
 from jaxreg.app.plot.figure import principal_axes, tilt
 from jaxreg.app.plot.report_curves import trace_curves
 from jaxreg.app.plot.report_page import write_page
@@ -55,7 +56,7 @@ def write_graph_report(
         MissingExtraError: if plotly is not installed.
     """
     if before is None:
-        before = jaxreg.average(graph, method=jaxreg.ShortestPaths())
+        before = chained(graph, solution)
     num = graph.num_poses
     labels = [str(x) for x in (range(num) if names is None else names)]
     if covariances is None and num <= MAX_COVARIANCES:

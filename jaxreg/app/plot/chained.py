@@ -1,0 +1,49 @@
+"""Poses to compare an answer with: motions chained from the first frame."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from jaxreg.averaging import AveragingSolution
+from jaxreg.graph.pose_graph import PoseGraph
+
+
+def chained(graph: PoseGraph, sol: AveragingSolution) -> AveragingSolution:
+    """A solution with the poses of `ShortestPaths`, by SciPy: no program is compiled.
+
+    Args:
+        graph: concrete.
+        sol: of it, whose poses are replaced.
+    """
+    weight = np.asarray(graph.weight, float)
+    edges, used = np.asarray(graph.edges), np.flatnonzero(weight > 0)
+    motions = np.asarray(graph.T_i_j, float)
+    num, d = graph.num_poses, motions.shape[-1] - 1
+    # Of two motions between the same frames the better one.
+    used = used[np.argsort(-weight[used], kind="stable")]
+    ends = np.sort(edges[used], axis=1)
+    used = used[np.unique(ends @ [num, 1], return_index=True)[1]]
+    i, j = edges[used].T
+    distance, before = dijkstra(
+        coo_array((1 / weight[used], (i, j)), (num, num)),
+        directed=False,
+        indices=0,
+        return_predecessors=True,
+    )
+    row = coo_array((1 + np.arange(len(used)), (i, j)), (num, num)).tocsr()
+    order = np.argsort(distance, kind="stable")[1 : np.isfinite(distance).sum()]
+    p = before[order]
+    forward, back = (np.asarray(row[a, b]).ravel() for a, b in ((p, order), (order, p)))
+    step = motions[used[np.maximum(forward, back) - 1]]
+    step[back > 0] = np.linalg.inv(step[back > 0])
+    T = np.tile(np.eye(d + 1), (num, 1, 1))
+    for k, start, T_start_k in zip(order, p, step, strict=True):
+        T[k] = T[start] @ T_start_k
+    return dataclasses.replace(
+        sol,
+        T_world_i=jnp.asarray(T, sol.T_world_i.dtype),
+        placed=jnp.asarray(np.isfinite(distance)),
+    )
