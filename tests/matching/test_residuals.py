@@ -8,7 +8,7 @@ import pytest
 from helpers import motion
 from matches import N, found_at, noisy_problem
 
-from jaxreg.local import turn_and_shift
+from jaxreg.local import GaussNewton, LocalOptimiser, turn_and_shift
 from jaxreg.matching import (
     PlaneToPlane,
     PointToPlane,
@@ -17,6 +17,7 @@ from jaxreg.matching import (
     match,
     moved,
 )
+from jaxreg.robust import GemanMcClure
 
 
 EPSILON = 1 / 128
@@ -96,6 +97,16 @@ def test_normal_equations_are_those_of_the_linearised_residual(d, residual):
 
         for mine, expected in both(weight):
             np.testing.assert_allclose(mine, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_masked_points_have_no_weight():
+    problem, T, _ = noisy_problem(3, np.float32)
+    mask = jnp.arange(N) % 3 > 0
+    masked = eqx.tree_at(lambda p: p.source_mask, problem, mask)
+    for residual in (PointToPlane(), PointToPoint()):
+        optimiser = LocalOptimiser(residual, GemanMcClure(), GaussNewton())
+        weight = optimiser.weights(found_at(masked, T), jnp.asarray(0.3))
+        np.testing.assert_array_equal(weight > 0, mask)
 
 
 @in_2d_and_3d

@@ -14,14 +14,16 @@ NUM = 400
 
 
 def surface(seed: int) -> np.ndarray:
-    """A bumpy sheet."""
+    """A bumpy ribbon: so narrow that the nearest points are not all around."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-1, 1, (2, NUM))
-    return np.stack([x, y, 0.2 * np.sin(4 * x + seed) * np.cos(3 * y)], axis=1)
+    y = 0.01 * y
+    z = 0.1 * np.sin(9 * x + seed)
+    return np.stack([x, y, z], axis=1)
 
 
 def prepared(kept: list[int], *, to_search: bool = True) -> PreparedScans:
-    """Of sheets of which so many points are left."""
+    """Of ribbons of which so many points are left."""
     points = jnp.asarray(np.stack([surface(k) for k in range(len(kept))]), jnp.float32)
     mask = jnp.arange(NUM) < jnp.asarray(kept)[:, None]
     return prepare_scans(jr.ParticleFilter(), points, mask, to_search=to_search)
@@ -39,6 +41,8 @@ def test_features_are_as_wide_as_the_coarser_scans_need(few):
     assert cloud.described is not None
     np.testing.assert_allclose(cloud.described.even, expected.even, atol=1e-5)
     np.testing.assert_allclose(cloud.described.odd, expected.odd, atol=1e-5)
+    wider = jax.jit(features_of)(cloud, jnp.asarray(1.2 * wanted))
+    assert float(jnp.max(jnp.abs(wider.even - expected.even))) > 1e-3
 
 
 def test_only_what_is_to_be_searched_for_has_features():
