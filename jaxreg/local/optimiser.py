@@ -32,8 +32,9 @@ class LocalOptimiser(eqx.Module):
     ) -> Motion:
         """Weighs a match and steps."""
         weight = self.weights(found, width)
-        # Each row of the sums would divide anew.
-        weight = once(jnp.asarray, weight, true=width > -jnp.inf, least=0)
+        # Each row of the sums would divide anew. (True of widths that are no numbers,
+        # too: what comes of them is passed on.)
+        weight = once(jnp.asarray, weight, true=~(width < -jnp.inf), least=0)
         return self.step(T_target_source, found, weight, self.residual)
 
     def weights(self, found: Match, width: Float[Array, ""]) -> Float[Array, " n"]:

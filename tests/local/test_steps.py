@@ -30,7 +30,7 @@ from jaxreg.matching import (
     moved,
 )
 from jaxreg.neighbours import BruteForce
-from jaxreg.robust import L2, Huber
+from jaxreg.robust import L2, GemanMcClure, Huber
 
 
 RESIDUALS = [PointToPoint(), PointToPlane(), PlaneToPlane(), Symmetric()]
@@ -87,6 +87,13 @@ def test_units_do_not_matter(step):
     T_new = _step(step, Symmetric(), T, found_at(problem, T), weight)
     T_mm = _step(step, Symmetric(), T_mm, found_at(mm, T_mm), weight)
     np.testing.assert_allclose(T_mm.at[:3, 3].divide(1000), T_new, atol=1e-4)
+
+
+def test_a_width_that_is_no_number_is_no_step_without_a_word():
+    problem, T, _ = noisy_problem(3, np.float32)
+    optimiser = LocalOptimiser(PointToPlane(), GemanMcClure(), GaussNewton())
+    after = eqx.filter_jit(optimiser)(problem, T, jnp.asarray(np.nan, jnp.float32))
+    assert not np.any(np.isfinite(after[:3]))
 
 
 @by_residual
