@@ -68,7 +68,8 @@ def test_the_most_agreed_pose_is_right(clouds):
     assert turn < 0.15
     assert shift < 3 * spacing
     assert used[0]
-    np.testing.assert_array_equal(T[0], best)
+    # The same poses by a copy of the program, which may round otherwise.
+    np.testing.assert_allclose(T[0], best, atol=1e-5)
 
 
 def test_clouds_described_before_propose_the_same(clouds):
