@@ -2,7 +2,7 @@
 
 They are summed in the frame of the source. There products of coordinates are the same
 for all poses, so that the sums of many particles are one matrix product, which takes a
-quarter of the time of one for each particle.
+third of the time of one for each particle.
 """
 
 import itertools
