@@ -24,8 +24,8 @@ def chained(graph: PoseGraph, sol: AveragingSolution) -> AveragingSolution:
     num, d = graph.num_poses, motions.shape[-1] - 1
     # Of two motions between the same frames the better one.
     used = used[np.argsort(-weight[used], kind="stable")]
-    ends = np.sort(edges[used], axis=1)
-    used = used[np.unique(ends @ [num, 1], return_index=True)[1]]
+    keys, best = np.unique(_keys(edges[used], num), return_index=True)
+    used = used[best]
     i, j = edges[used].T
     distance, before = dijkstra(
         coo_array((1 / weight[used], (i, j)), (num, num)),
@@ -33,17 +33,21 @@ def chained(graph: PoseGraph, sol: AveragingSolution) -> AveragingSolution:
         indices=0,
         return_predecessors=True,
     )
-    row = coo_array((1 + np.arange(len(used)), (i, j)), (num, num)).tocsr()
     order = np.argsort(distance, kind="stable")[1 : np.isfinite(distance).sum()]
-    p = before[order]
-    forward, back = (np.asarray(row[a, b]).ravel() for a, b in ((p, order), (order, p)))
-    step = motions[used[np.maximum(forward, back) - 1]]
-    step[back > 0] = np.linalg.inv(step[back > 0])
+    ways = np.stack([before[order], order], axis=1)
+    row = used[np.searchsorted(keys, _keys(ways, num))]
+    step, back = motions[row], edges[row, 1] != order
+    step[back] = np.linalg.inv(step[back])
     T = np.tile(np.eye(d + 1), (num, 1, 1))
-    for k, start, T_start_k in zip(order, p, step, strict=True):
+    for (start, k), T_start_k in zip(ways, step, strict=True):
         T[k] = T[start] @ T_start_k
     return dataclasses.replace(
         sol,
         T_world_i=jnp.asarray(T, sol.T_world_i.dtype),
         placed=jnp.asarray(np.isfinite(distance)),
     )
+
+
+def _keys(pairs: np.ndarray, num: int) -> np.ndarray:
+    """One number for each two frames, whichever comes first."""
+    return np.sort(pairs.astype(np.int64), axis=1) @ np.array([num, 1])

@@ -32,3 +32,12 @@ def test_motions_are_chained_along_the_shortest_paths_whichever_way_they_point(d
     np.testing.assert_allclose(before.T_world_i[reached], T[reached], atol=1e-5)
     eye = np.broadcast_to(np.eye(d + 1), (3, d + 1, d + 1))
     np.testing.assert_array_equal(before.T_world_i[~reached], eye)
+
+
+def test_a_frame_that_nothing_joins_is_alone():
+    for edges in ([(1, 2)], np.zeros((0, 2), int)):
+        motions = np.tile(motion(3, 0.3, 1.0, 1), (len(edges), 1, 1))
+        graph = jr.PoseGraph.from_edges(edges, motions, num_poses=3)
+        before = chained(graph, jr.average(graph, jr.SpanningTree()))
+        np.testing.assert_array_equal(before.placed, [True, False, False])
+        np.testing.assert_array_equal(before.T_world_i, np.tile(np.eye(4), (3, 1, 1)))
