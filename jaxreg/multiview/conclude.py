@@ -19,7 +19,7 @@ from jaxreg.multiview.likely_overlap import LikelyOverlap
 from jaxreg.multiview.method import min_log_evidence
 from jaxreg.multiview.near_pairs import near_pairs
 from jaxreg.multiview.pair_trust import pair_trust
-from jaxreg.multiview.place import Placement, place, prior_weight
+from jaxreg.multiview.place import Placement, agreeing, place, prior_weight
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -87,7 +87,8 @@ def _solution(
 ) -> ReconstructionSolution:
     """In the frames and unit of the input."""
     found = motions.in_input_frames(scans)
-    one = found.of_modes(mode)
+    _, agrees = agreeing(motions, placement, least)
+    one = found.of_modes(mode, agrees)
     overlap, T_i_j = one.overlap[:, 0], one.T_i_j[:, 0]
     weight = prior_weight(one, least)
     real = motions.pairs[:, 0] != motions.pairs[:, 1]

@@ -23,6 +23,7 @@ from jaxreg.graph.hang import with_hung
 from jaxreg.graph.joined import in_loops_of_three, joined
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import components
+from jaxreg.multiview.choose_pairs import most_tries
 from jaxreg.multiview.parts import part_numbers, part_sizes
 from jaxreg.multiview.relative_motions import RelativeMotions
 
@@ -35,6 +36,9 @@ _AGREES = 0.15
 # Averages at most: of the best modes, then of those that agree with the poses from
 # these, where these are others.
 _PASSES = 2
+# Of something symmetric at most one likely pair of so many is clear: of cubes none, of
+# views of rooms two in five, of scans of objects nearly all.
+_SYMMETRIC = 10
 # Pairs that `register` would not believe may count where others confirm them: those
 # whose log evidence is at most so much below.
 _CONFIRMABLE = 1.0
@@ -90,44 +94,52 @@ def place(
 
     Each pair is a mixture of its modes, of which one at a time counts: the best, and
     once poses are known, the one that agrees with them, with its own overlap (a
-    max-mixture, as of Olson and Agarwal 2013).
+    max-mixture, as of Olson and Agarwal 2013). A mode that agrees has no rivals any
+    more; until then they count against it, unless the scans are of something symmetric,
+    where one is as good as another.
 
     The root is the scan of lowest number in the largest connected set of scans. The
     other sets of two and more are averaged with it, each hung on it by one motion of no
     consequence. Averaging starts from the spanning tree of the largest weights
     (`prior_weight`), and stays there where no pairs agree with each other.
 
-    A pair joins scans on its own if its log evidence exceeds `least` by log(v - 1):
-    each scan is tried against as many others, so the rate of false alarms of one trial
-    is divided by them. Others join parts that a second pair, or a loop of three parts,
-    confirms.
+    A pair joins scans on its own if its log evidence exceeds `least` by the logarithm
+    of `most_tries(v)`: each scan is tried against as many others, so the rate of false
+    alarms of one trial is divided by them. Others join parts that a second pair, or a
+    loop of three parts, confirms.
     """
     if averaging is None:
         averaging = Correntropy(initialiser=SpanningTree())
     best = jnp.zeros(len(motions.pairs), jnp.int32)
+    alike = jnp.full(len(best), _is_symmetric(motions, least))
     if motions.num_modes == 1:
-        return _averaged(motions, best, num_scans, averaging, least)
+        return _averaged(motions, best, alike, num_scans, averaging, least)
 
     def again(state: _Pass) -> _Pass:
-        found = _averaged(motions, state.mode, num_scans, averaging, least)
-        mode = _agreeing(motions, found, least)
-        return _Pass(mode, found, state.number + 1, jnp.any(mode != state.mode))
+        found = _averaged(
+            motions, state.mode, state.agrees, num_scans, averaging, least
+        )
+        mode, agrees = agreeing(motions, found, least)
+        differs = jnp.any((mode != state.mode) | (agrees != state.agrees))
+        return _Pass(mode, agrees, found, state.number + 1, differs)
 
     def unfinished(state: _Pass) -> Array:
         return (state.number < _PASSES) & state.differs
 
-    start = jax.eval_shape(again, _Pass(best, None, jnp.asarray(0), jnp.asarray(True)))
+    first = _Pass(best, alike, None, jnp.asarray(0), jnp.asarray(True))
+    start = jax.eval_shape(again, first)
     start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
-    start = start._replace(mode=best, differs=jnp.asarray(True))
+    start = start._replace(agrees=alike, differs=jnp.asarray(True))
     found = control.while_loop(unfinished, again, start).found
     assert found is not None
     return found
 
 
 class _Pass(NamedTuple):
-    """An average by some modes, and the modes that agree with it."""
+    """An average by some modes, and the modes that agree with it, where any does."""
 
     mode: Int[Array, " e"]
+    agrees: Bool[Array, " e"]
     found: Placement | None
     number: Int[Array, ""]
     differs: Bool[Array, ""]
@@ -136,12 +148,13 @@ class _Pass(NamedTuple):
 def _averaged(
     motions: RelativeMotions,
     mode: Int[Array, " e"],
+    agrees: Bool[Array, " e"],
     num_scans: int,
     averaging: AbstractAverager,
     least: Scalar,
 ) -> Placement:
-    """By one mode of each pair."""
-    pairs, one = motions.pairs, motions.of_modes(mode)
+    """By one mode of each pair, which others rival unless it agrees with poses."""
+    pairs, one = motions.pairs, motions.of_modes(mode, agrees)
     T_i_j, log_evidence = one.T_i_j[:, 0], one.log_evidence[:, 0]
     trusted = prior_weight(one, least)
     label = components(pairs, trusted, num_scans)
@@ -156,7 +169,7 @@ def _averaged(
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
     agreed = jnp.where(joins(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
-    strong = log_evidence >= least + math.log(max(num_scans - 1, 1))
+    strong = log_evidence >= least + math.log(most_tries(num_scans))
     part = _confirmed_components(pairs, agreed, num_scans, strong)
     return Placement(
         T_world_i=solution.T_world_i[swap],
@@ -170,16 +183,25 @@ def _averaged(
     )
 
 
-def _agreeing(
+def _is_symmetric(motions: RelativeMotions, least: Scalar) -> Bool[Array, ""]:
+    """Whether nearly all pairs that are likely have rivals that are as likely."""
+    clear = jnp.sum(motions.log_odds[:, 0] >= least)
+    return jnp.sum(motions.log_evidence[:, 0] >= least) >= _SYMMETRIC * clear
+
+
+def agreeing(
     motions: RelativeMotions, found: Placement, least: Scalar
-) -> Int[Array, " e"]:
-    """The first of each pair's modes that agrees with the poses; if none, the best."""
+) -> tuple[Int[Array, " e"], Bool[Array, " e"]]:
+    """The first of each pair's modes that agrees with the poses, and if there is one.
+
+    If there is none, the best.
+    """
     i, j = motions.pairs.T
     T_i_j = lie.between(found.T_world_i[i], found.T_world_i[j])
     turn, shift = displacement(T_i_j[:, None], motions.T_i_j)
     agrees = (turn < _AGREES) & (shift < _AGREES) & likely(motions, least)
     agrees = agrees & found.together(i, j)[:, None]
-    return jnp.argmax(agrees, axis=1).astype(jnp.int32)
+    return jnp.argmax(agrees, axis=1).astype(jnp.int32), jnp.any(agrees, axis=1)
 
 
 def displacement(

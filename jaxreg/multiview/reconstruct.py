@@ -38,6 +38,7 @@ from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.prepare import PreparedScans, prepare_scans
 from jaxreg.multiview.register_pairs import OnPairs, Rounds
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
+from jaxreg.multiview.similar_scans import words_of
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.multiview.workers import Workers, check_executor
 from jaxreg.particle import ParticleFilter
@@ -66,9 +67,11 @@ def reconstruct(
 ) -> ReconstructionSolution:
     """Brings scans into one frame, without an initial guess.
 
-    All pairs of up to 20 scans are registered, of more at most ten pairs a scan: first
-    each with a few others, then those that join parts, close loops, or hold scans that
-    hang by a thread.
+    Each scan is first registered with a few others that look like it, then pairs follow
+    that join parts, close loops, or hold scans that hang by a thread: of up to 20 scans
+    at most all pairs, of more ten a scan. Methods other than `ParticleFilter` in 3D do
+    not tell which scans look alike, nor are more than 512 compared: there all pairs of
+    up to 20 scans are registered, and of more the first ones are drawn at random.
 
     Args:
         scans: a list of `(n_i, d)` point sets, or a padded array `(v, n, d)`. Of a
@@ -278,7 +281,7 @@ def _known(
     first = None
     if earlier is not None:
         rng = np.random.default_rng(num_old)
-        new = first_pairs(scans.num_scans, order, rng)
+        new = first_pairs(scans.num_scans, order, rng, words_of(scans))
         first = np.concatenate([motions.pairs, new[new[:, 1] >= num_old]])
         first = np.unique(first, axis=0)
     return motions.heard(scans), first

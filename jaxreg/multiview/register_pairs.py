@@ -28,6 +28,7 @@ from jaxreg.multiview.method import min_log_evidence, num_kept
 from jaxreg.multiview.place import Placement, joins, likely, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
+from jaxreg.multiview.similar_scans import words_of
 from jaxreg.multiview.workers import Workers
 from jaxreg.registrar import AbstractRegistrar
 
@@ -90,8 +91,9 @@ class Rounds:
         """
         bits = np.asarray(jax.random.key_data(self.key)).ravel()
         rng = np.random.default_rng(bits)
+        words = words_of(self.scans)
         if pairs is None:
-            pairs = first_pairs(self.scans.num_scans, order, rng)
+            pairs = first_pairs(self.scans.num_scans, order, rng, words)
             if order == "sequential":
                 self._follow()
         self.most = max(self.most, len(pairs))
@@ -102,7 +104,7 @@ class Rounds:
             placement, tried, trusted, near = self._evidence()
             part = np.asarray(placement.part)
             ids, overlap = np.asarray(near.pairs), np.asarray(near.overlap)
-            pairs = next_pairs(tried, trusted, ids, overlap, part, rng)
+            pairs = next_pairs(tried, trusted, ids, overlap, part, rng, words)
             pairs = pairs[: self.most - self.num_tried]
             if order == "sequential":
                 held = np.bincount(tried[trusted].ravel(), minlength=len(part)) >= SAFE

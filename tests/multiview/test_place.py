@@ -77,3 +77,46 @@ def test_loops_join_scans_none_of_whose_pairs_would_be_believed(num_loops):
     motions = RelativeMotions(jnp.asarray(ids), jnp.asarray(T_i_j), share, told, share)
     found = place(motions, 3, None, LEAST)
     np.testing.assert_array_equal(found.part, [0, 0, 0] if num_loops else [0, 1, 2])
+
+
+def _told(ids: list[tuple[int, int]], told: list[list[float]]) -> RelativeMotions:
+    """Pairs whose first mode is right, the second is of another pose."""
+    i, j = np.array(ids).T
+    right = np.linalg.inv(T_TRUE[i]) @ T_TRUE[j]
+    wrong = np.stack([motion(50 + k, 3) for k in range(len(ids))])
+    modes = np.stack([right, wrong], axis=1).astype(np.float32)
+    share = jnp.full((len(ids), 2), 0.4)
+    evidence = jnp.asarray(told, jnp.float32)
+    return RelativeMotions(
+        jnp.asarray(ids, jnp.int32), jnp.asarray(modes), share, evidence, share
+    )
+
+
+def test_log_odds_count_rivals_and_that_none_is_right():
+    motions = _told([(0, 1), (1, 2), (2, 3)], [[4, -100], [4, 4], [4, 2.5]])
+    odds = np.asarray(motions.log_odds)
+    np.testing.assert_allclose(odds[0], [4, -100 - np.log1p(np.exp(4))], rtol=1e-5)
+    np.testing.assert_allclose(odds[1], -np.log1p(np.exp(-4)), rtol=1e-4)
+    np.testing.assert_allclose(odds[2, 0], 4 - np.log1p(np.exp(2.5)), rtol=1e-4)
+    alone = jnp.array([True, True, False])
+    one = motions.of_modes(jnp.zeros(3, int), alone)
+    np.testing.assert_allclose(one.log_evidence[:, 0], [4, 4, odds[2, 0]], rtol=1e-5)
+
+
+def test_an_answer_with_a_rival_joins_no_scans_unless_others_confirm_it():
+    clear, rivalled = [5.0, -100.0], [5.0, 4.8]
+    ids = [(0, 1), (1, 2), (2, 3), (3, 4)]
+    told = [clear, clear, clear, rivalled]
+    assert np.asarray(place(_told(ids, told), 5, None, LEAST).part).tolist() == [
+        0, 0, 0, 0, 4,
+    ]  # fmt: skip
+    more = _told([*ids, (2, 4)], [*told, rivalled])
+    found = place(more, 5, None, LEAST)
+    np.testing.assert_array_equal(found.part, 0)
+    np.testing.assert_array_equal(found.mode, 0)
+
+
+def test_of_something_symmetric_one_mode_is_as_good_as_another():
+    ids = [(0, 1), (1, 2), (2, 3)]
+    found = place(_told(ids, [[5.0, 4.9]] * 3), 4, None, LEAST)
+    np.testing.assert_array_equal(found.part, 0)

