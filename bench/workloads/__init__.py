@@ -221,7 +221,8 @@ WORKLOADS = {
     ),
     "multiview_size": Workload(
         "Many scans: time against their number",
-        "The sculpture from ever more sides, no guess. `pairs` is how many "
+        "The sculpture from ever more sides, no guess; and views cut from a real "
+        "kitchen's fragments, from cameras that look anywhere. `pairs` is how many "
         "registrations were spent.",
         quick=False,
     ),

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -13,11 +12,11 @@ from bench.case import Case, Judged, Method, Options, Solve
 from bench.motion_scans import SETS, load_scans
 from bench.peers.multiview import Multiway
 from bench.records import Metric, error
+from bench.room_views import kitchen
 from bench.surfaces import Surface, surface_distance
 from bench.turntable import without_displacement
 from jaxreg import reconstruct
 from jaxreg.datasets import sculpture_scans
-from jaxreg.io import read_log
 from jaxreg.metrics import rotation_error, translation_error
 
 
@@ -85,20 +84,8 @@ def _full(options: Options) -> Iterator[Scans]:
             yield Scans(title, scans, T_world_i, 0.0025, 0.5, True)
     folder = options.data / "kitchen_fragments"
     if folder.exists():
-        yield _kitchen(folder)
-
-
-def _kitchen(folder: Path) -> Scans:
-    """Fragments of a room; the truth of each is its motion to the first."""
-    with np.load(folder / "fragments.npz") as file:
-        scans = [file[name] for name in file.files]
-    truth = read_log(folder / "gt.log")
-    T_world_i = np.tile(np.eye(4), (len(scans), 1, 1))
-    edges, T_i_j = np.asarray(truth.edges), np.asarray(truth.T_i_j)
-    for (i, j), T in zip(edges, T_i_j, strict=True):
-        if i == 0:
-            T_world_i[j] = T
-    return Scans("kitchen, 6 fragments", scans, T_world_i, 0.05, 0.3, True)
+        scans, T_world_i = kitchen(folder)
+        yield Scans("kitchen, 6 fragments", scans, T_world_i, 0.05, 0.3, True)
 
 
 def _own(scans: list[np.ndarray], seed: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Time against the number of scans: the sculpture from 12 to 100 sides."""
+"""Time against the number of scans: the sculpture from 12 to 100 sides, a room."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -10,6 +10,7 @@ import numpy as np
 from bench.case import Case, Judged, Options
 from bench.peers.multiview import Multiway
 from bench.records import Metric
+from bench.room_views import room_views
 from bench.workloads.multiview import judge as judge_poses
 from bench.workloads.multiview import own_method, peer_method
 from jaxreg import reconstruct
@@ -22,7 +23,6 @@ _PEER_UP_TO = 24
 
 def cases(options: Options) -> Iterator[Case]:
     """A case per number of scans."""
-    del options
     peer = Multiway(0.005, 0.002, 0.5, camera_at_origin=False)
     for num in (12, 24, 48, 100):
         scans, T_world_i = sculpture_scans(num, seed=0)
@@ -38,6 +38,28 @@ def cases(options: Options) -> Iterator[Case]:
             judge=partial(judge, T_world_i),
             x=float(num),
             x_label="scans",
+        )
+    yield from _room(options)
+
+
+def _room(options: Options) -> Iterator[Case]:
+    """Views of a kitchen, of which many show little but a wall."""
+    folder = options.data / "kitchen_fragments"
+    if not folder.exists():
+        return
+    peer = Multiway(0.05, 0.02, 0.3, camera_at_origin=False)
+    for num in (24, 60):
+        views, T_world_i = room_views(folder, num)
+        methods = [own_method(_own)]
+        if num <= _PEER_UP_TO:
+            methods.append(peer_method(peer, partial(_theirs, peer)))
+        yield Case(
+            name=f"{num} views of a room",
+            data=f"kitchen, {num} views of up to 20,000 points",
+            methods=methods,
+            trials=[(views, seed) for seed in range(2)],
+            long=True,
+            judge=partial(judge, T_world_i),
         )
 
 
