@@ -66,6 +66,16 @@ def test_a_loop_is_closed_where_the_poses_say_that_scans_overlap():
     assert len(next_pairs(tried, trusted, near, 0 * overlap, part, RNG)) == 0
 
 
+def test_a_loop_is_not_closed_by_scans_that_share_little():
+    steps = [np.stack([np.arange(20 - k), np.arange(k, 20)], axis=1) for k in (1, 2, 3)]
+    tried, part = np.concatenate(steps), np.zeros(20, int)
+    trusted, near = np.ones(len(tried), bool), np.array([[0, 19]])
+    for overlap, pairs in ((0.25, []), (0.35, [[0, 19]])):
+        share = np.array([overlap])
+        found = next_pairs(tried, trusted, near, share, part, RNG)
+        assert found.tolist() == pairs
+
+
 def test_of_long_loops_that_of_larger_overlap_is_closed():
     chain = np.stack([np.arange(99), np.arange(1, 100)], axis=1)
     trusted, part = np.ones(len(chain), bool), np.zeros(100, int)
