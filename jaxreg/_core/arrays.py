@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.checks import TRACED
 from jaxreg._core.platforms import by_platform
@@ -36,6 +36,11 @@ def _as_scalar(x: float | Array | None) -> Array | None:
 def _is_number(x: object) -> bool:
     numbers = int, float, np.integer, np.floating
     return isinstance(x, numbers) and not isinstance(x, bool)
+
+
+def full_matmul(a: Float[Array, "i j"], b: Float[Array, "j l"]) -> Float[Array, "i l"]:
+    """The matrix product; accelerators would round its factors to ten bits."""
+    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
 def cast_floats(tree: Tree, dtype: Any) -> Tree:

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core.arrays import full_matmul
 from jaxreg._core.restarts import AbstractRestarts
 from jaxreg._core.solver import Lowered, Solver
 from jaxreg._core.typing import Motion, Scalar
@@ -12,7 +13,7 @@ from jaxreg.correlation.pairs import kernel_correlation
 from jaxreg.correlation.quadratic import Quadratic
 from jaxreg.geometry import lie
 from jaxreg.linear.condensed import AbstractSquares, condensed
-from jaxreg.local import full_matmul, tangent_slopes, turn_and_shift
+from jaxreg.local import tangent_slopes, turn_and_shift
 
 
 # Beside a curvature of one by shifts: directions that are free keep still.

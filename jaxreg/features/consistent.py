@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.arrays import full_matmul
 from jaxreg._core.typing import Scalar
 from jaxreg.features.correspond import Correspondences
 from jaxreg.geometry import lie
@@ -56,7 +57,7 @@ def consistent_poses(pairs: Correspondences, tolerance: Scalar) -> Agreed:
         tolerance: of distances.
     """
     compatible = _compatible(pairs, tolerance).astype(pairs.source.dtype)
-    common = compatible * _product(compatible, compatible)
+    common = compatible * full_matmul(compatible, compatible)
     num = len(pairs.mask)
     score, partner = lax.top_k(common, min(_PARTNERS, num))
     agree = jnp.eye(num, dtype=common.dtype)
@@ -100,15 +101,17 @@ def _between(
     distance = jnp.sqrt(sum(x * x for x in delta))
     over = sum(x * n[:, None] for x, n in zip(delta, normals.T, strict=True))
     over = jnp.abs(over) / jnp.where(distance > 0, distance, 1)
-    return distance, jnp.abs(_product(normals, normals.T)), over
+    return distance, jnp.abs(full_matmul(normals, normals.T)), over
 
 
 def _fitted(pairs: Correspondences, weight: Float[Array, "b m"]) -> Array:
     """`(b, 4, 4)` rigid fits of weighted correspondences (Kabsch 1976)."""
     total = jnp.maximum(jnp.sum(weight, axis=1), 1)[:, None]
-    source, target = (_product(weight, x) / total for x in (pairs.source, pairs.target))
+    source, target = (
+        full_matmul(weight, x) / total for x in (pairs.source, pairs.target)
+    )
     outer = (pairs.target[:, :, None] * pairs.source[:, None, :]).reshape(-1, 9)
-    spread = _product(weight, outer).reshape(-1, 3, 3)
+    spread = full_matmul(weight, outer).reshape(-1, 3, 3)
     spread = spread - (total * target)[:, :, None] * source[:, None, :]
     R = nearest_rotation(spread)
     return lie.compose(R, target - _turned(R, source))
@@ -121,16 +124,12 @@ def _agreeing(
     R, t = lie.rotation(T), lie.translation(T)
     sq = cosine = jnp.zeros((), t.dtype)
     for i in range(3):
-        moved = _product(R[:, i], pairs.source.T) + t[:, i : i + 1]
+        moved = full_matmul(R[:, i], pairs.source.T) + t[:, i : i + 1]
         sq = sq + (moved - pairs.target[:, i]) ** 2
-        turned = _product(R[:, i], pairs.source_normals.T)
+        turned = full_matmul(R[:, i], pairs.source_normals.T)
         cosine = cosine + turned * pairs.target_normals[:, i]
     return (sq < tolerance**2) & (jnp.abs(cosine) > _ALIKE) & pairs.mask
 
 
 def _turned(R: Float[Array, "b 3 3"], x: Float[Array, "b 3"]) -> Float[Array, "b 3"]:
     return jnp.sum(R * x[:, None, :], axis=-1)
-
-
-def _product(a: Array, b: Array) -> Array:
-    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)

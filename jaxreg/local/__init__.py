@@ -17,7 +17,6 @@ from jaxreg.local.steps import LevenbergMarquardt as LevenbergMarquardt
 from jaxreg.local.steps import OptimistixStep as OptimistixStep
 from jaxreg.local.steps import condition as condition
 from jaxreg.local.steps import decoupled_error as decoupled_error
-from jaxreg.local.steps import full_matmul as full_matmul
 from jaxreg.local.steps import gyration_radius as gyration_radius
 from jaxreg.local.steps import tangent_slopes as tangent_slopes
 from jaxreg.local.steps import turn_and_shift as turn_and_shift

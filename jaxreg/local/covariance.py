@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core.arrays import full_matmul
 from jaxreg._core.typing import Motion
 from jaxreg.linear.small import eigh
 from jaxreg.local.optimiser import LocalOptimiser
-from jaxreg.local.steps.base import full_matmul
 from jaxreg.matching.problem import Match, Problem, inner, match
 from jaxreg.matching.residuals.gram import along
 

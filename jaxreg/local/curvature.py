@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core.arrays import full_matmul
 from jaxreg._core.typing import Motion
 from jaxreg.linear.small import solve_semidefinite
 from jaxreg.local.covariance import pose_covariance
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.steps import condition, gyration_radius
-from jaxreg.local.steps.base import full_matmul
 from jaxreg.matching.problem import Match, Problem
 from jaxreg.matching.residuals import AbstractResidual, PointToPlane, PointToPoint
 

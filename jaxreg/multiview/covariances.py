@@ -14,13 +14,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxreg._core.arrays import cast_floats
+from jaxreg._core.arrays import cast_floats, full_matmul
 from jaxreg._core.typing import ArrayLike
 from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.linear.small import product
 from jaxreg.local.covariance import answer, inverse_within
-from jaxreg.local.steps.base import full_matmul
 from jaxreg.matching.problem import match
 from jaxreg.multiview.check_scans import padded_scans
 from jaxreg.multiview.far_scans import FarScans

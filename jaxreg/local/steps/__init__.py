@@ -2,7 +2,6 @@
 
 from jaxreg.local.steps.base import AbstractStep as AbstractStep
 from jaxreg.local.steps.base import decoupled_error as decoupled_error
-from jaxreg.local.steps.base import full_matmul as full_matmul
 from jaxreg.local.steps.base import tangent_slopes as tangent_slopes
 from jaxreg.local.steps.base import turn_and_shift as turn_and_shift
 from jaxreg.local.steps.closed_form import ClosedForm as ClosedForm

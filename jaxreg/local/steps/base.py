@@ -5,9 +5,9 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core.arrays import full_matmul
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.typing import Motion
 from jaxreg.geometry import lie
@@ -29,11 +29,6 @@ class AbstractStep(BriefModule):
         residual: AbstractResidual,
     ) -> Motion:
         """The updated pose; the pose itself where the weights are all zero."""
-
-
-def full_matmul(a: Float[Array, "i j"], b: Float[Array, "j l"]) -> Float[Array, "i l"]:
-    """The matrix product; accelerators would round its factors to ten bits."""
-    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
 def turn_and_shift(T_target_source: Motion, tangent: Float[Array, " k"]) -> Motion:

@@ -3,10 +3,11 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg._core.arrays import full_matmul
 from jaxreg._core.typing import Motion
 from jaxreg.geometry import lie
 from jaxreg.geometry.nearest_rotation import nearest_rotation
-from jaxreg.local.steps.base import AbstractStep, full_matmul
+from jaxreg.local.steps.base import AbstractStep
 from jaxreg.matching.problem import Match
 from jaxreg.matching.residuals import AbstractResidual, Moments, PointToPoint
 

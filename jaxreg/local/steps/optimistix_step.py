@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxreg._core.arrays import traced
+from jaxreg._core.arrays import full_matmul, traced
 from jaxreg._core.checks import check_counts, check_positive
 from jaxreg._core.solver import Solver
 from jaxreg._core.typing import Motion
@@ -16,7 +16,6 @@ from jaxreg.linear.balance import AbstractBalance, balanced, by_slopes
 from jaxreg.linear.condensed import AbstractSquares, condensed
 from jaxreg.local.steps.base import (
     AbstractStep,
-    full_matmul,
     tangent_slopes,
     turn_and_shift,
 )

@@ -11,9 +11,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg._core.arrays import full_matmul
 from jaxreg.matching.problem import Match
 
 
@@ -35,13 +35,13 @@ def metric_equations(
     d, number = len(p), len(metric)
     products = [a * b for a, b in _each_two([jnp.ones_like(p[0]), *p])]
     rows = jnp.stack([weight * x for x in (*metric, *force)])
-    sums = _product(rows, jnp.stack(products).T)
+    sums = full_matmul(rows, jnp.stack(products).T)
     # Sums of M_ij p_b p_c with 1 as p_0, at row (i, b) and column (j, c).
     spread = sums[:number][_places(d)][..., _places(d + 1)]
     spread = jnp.swapaxes(spread, 1, 2).reshape(d * (d + 1), -1)
-    pull = _product(R.T, sums[number:, : d + 1]).reshape(-1, 1)
+    pull = full_matmul(R.T, sums[number:, : d + 1]).reshape(-1, 1)
     K = _turned(R, jnp.asarray(_tangents(d), weight.dtype))
-    return _product(_product(K, spread), K.T), _product(K, pull)[:, 0]
+    return full_matmul(full_matmul(K, spread), K.T), full_matmul(K, pull)[:, 0]
 
 
 def outer(rows: Float[Array, "d n"]) -> list[Float[Array, " n"]]:
@@ -80,9 +80,5 @@ def _tangents(d: int) -> np.ndarray:
 def _turned(R: Float[Array, "d d"], K: Float[Array, "k m"]) -> Float[Array, "k m"]:
     """Tangents of the source's frame as those of the target's."""
     d = len(R)
-    turn = _product(R, K[d:]) if d == 3 else K[d:]
-    return jnp.concatenate([_product(R, K[:d]), turn])
-
-
-def _product(a: Float[Array, "i j"], b: Float[Array, "j l"]) -> Float[Array, "i l"]:
-    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
+    turn = full_matmul(R, K[d:]) if d == 3 else K[d:]
+    return jnp.concatenate([full_matmul(R, K[:d]), turn])
