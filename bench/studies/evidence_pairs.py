@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.motion_scans import SETS, load_scans
+from bench.room_views import room_views
 from bench.studies.streets import TOLERANCE, street_pair
 from bench.workloads import sensor_data
 from bench.workloads.filter_data import horse_model
@@ -79,6 +80,13 @@ def kitchen(data: Path) -> Iterator[Pair]:
         yield Pair(f"kitchen {i} {j}", scans[j], scans[i], T, 0.2)
 
 
+def views(data: Path) -> Iterator[Pair]:
+    """What cameras that stand in the room would see, many of little but a wall."""
+    folder = data / "kitchen_fragments"
+    if folder.is_dir():
+        yield from _all_pairs("view", *room_views(folder, 24), 0.15)
+
+
 def sequences(data: Path) -> Iterator[Pair]:
     """All pairs of scans of two lidars that drive and are carried."""
     for found in sensor_data.sequences(data):
@@ -142,6 +150,7 @@ KINDS: dict[str, Callable[[Path], Iterator[Pair]]] = {
     "bunny": lambda data: objects("bunny", data),
     "dragon": lambda data: objects("dragon", data),
     "kitchen": kitchen,
+    "views": views,
     "sequences": sequences,
     "sensors": sensors,
     "strangers": strangers,
