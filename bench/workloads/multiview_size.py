@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from bench.case import Case, Judged, Options
+from bench.case import Case, Judged, Method, Options
 from bench.peers.multiview import Multiway
 from bench.records import Metric
 from bench.room_views import room_views
@@ -26,13 +26,10 @@ def cases(options: Options) -> Iterator[Case]:
     peer = Multiway(0.005, 0.002, 0.5, camera_at_origin=False)
     for num in (12, 24, 48, 100):
         scans, T_world_i = sculpture_scans(num, seed=0)
-        methods = [own_method(_own)]
-        if num <= _PEER_UP_TO:
-            methods.append(peer_method(peer, partial(_theirs, peer)))
         yield Case(
             name=f"{num} scans",
             data=f"sculpture, {num} views of 8,000 points",
-            methods=methods,
+            methods=_methods(num, peer),
             trials=[(scans, seed) for seed in range(3)],
             long=True,
             judge=partial(judge, T_world_i),
@@ -50,17 +47,21 @@ def _room(options: Options) -> Iterator[Case]:
     peer = Multiway(0.05, 0.02, 0.3, camera_at_origin=False)
     for num in (24, 60):
         views, T_world_i = room_views(folder, num)
-        methods = [own_method(_own)]
-        if num <= _PEER_UP_TO:
-            methods.append(peer_method(peer, partial(_theirs, peer)))
         yield Case(
             name=f"{num} views of a room",
             data=f"kitchen, {num} views of up to 20,000 points",
-            methods=methods,
+            methods=_methods(num, peer),
             trials=[(views, seed) for seed in range(2)],
             long=True,
             judge=partial(judge, T_world_i),
         )
+
+
+def _methods(num: int, peer: Multiway) -> list[Method]:
+    """Ours, and the peer's where its pairs are few enough."""
+    if num > _PEER_UP_TO:
+        return [own_method(_own)]
+    return [own_method(_own), peer_method(peer, partial(_theirs, peer))]
 
 
 def _own(scans: list[np.ndarray], seed: int) -> tuple[np.ndarray, int]:

@@ -28,15 +28,15 @@ def words_of(scans: PreparedScans) -> np.ndarray | None:
     Args:
         scans: prepared scans.
     """
-    from scipy.cluster.vq import vq  # at use: a start takes a tenth longer by it
-
-    clouds = scans.clouds if scans.clouds.judged is None else scans.clouds.judged
-    if clouds.described is None:
+    described = scans.clouds.as_judged.described
+    if described is None:
         return None
-    scan, row = np.nonzero(np.asarray(clouds.described.mask))
+    scan, row = np.nonzero(np.asarray(described.mask))
     if not len(scan):
         return None
-    features = np.asarray(clouds.described.even)[scan, row]
+    from scipy.cluster.vq import vq  # at use: a start takes a tenth longer by it
+
+    features = np.asarray(described.even)[scan, row]
     drawn = np.random.default_rng(0).permutation(len(scan))[:_WORDS]
     word, _ = vq(features, features[drawn])
     counts = np.zeros((scans.num_scans, len(drawn)))

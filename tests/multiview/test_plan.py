@@ -95,7 +95,7 @@ def test_the_first_pairs_are_of_scans_that_look_alike():
     in_order = j - i == 1
     assert np.sum(in_order) == 59
     same = i % 4 == j % 4
-    # One in 24 of each is chosen of its own kind, of which there are 15, and of others.
+    # The most alike is of its own kind, and of the 20 that one is drawn from 14 are.
     assert np.sum(same[~in_order]) >= 60
     best = np.sort(np.stack([np.arange(60), near], axis=1), axis=1)
     assert {tuple(x) for x in best} <= {tuple(x) for x in pairs}
