@@ -51,7 +51,7 @@ def _room(options: Options) -> Iterator[Case]:
             name=f"{num} views of a room",
             data=f"kitchen, {num} views of up to 20,000 points",
             methods=_methods(num, peer),
-            trials=[(views, seed) for seed in range(2)],
+            trials=[(views, seed) for seed in range(3)],
             long=True,
             judge=partial(judge, T_world_i),
         )
