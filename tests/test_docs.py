@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[1]
 THRESHOLDS = {
     jr.Status.DEGENERATE: (curvature._DEGENERATE, ascent._FREE),
     jr.Status.LOW_OVERLAP: (float(jnp.asarray(jr.ParticleFilter().min_log_evidence)),),
-    jr.Status.AMBIGUOUS: (conclude.RIVAL_MARGIN,),
+    jr.Status.AMBIGUOUS: (conclude.LEAST_ODDS,),
     jr.Status.DISCONNECTED: (place._MIN_TRUST,),
     jr.Status.UNIT_DIFFERS: (OTHER_UNIT,),
 }

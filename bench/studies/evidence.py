@@ -22,10 +22,9 @@ from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
 from bench.studies.evidence_modes import NUMBERS, modes_of
-from bench.studies.evidence_pairs import GENERATED, KINDS
+from bench.studies.evidence_pairs import CHECKED, GENERATED, KINDS
 from bench.studies.reliability import Reliability, draw
 from jaxreg.matching import evidence
-from jaxreg.particle.conclude import RIVAL_MARGIN
 
 
 # Keys of a pair.
@@ -39,7 +38,7 @@ _PLOT = Path(__file__).parents[1] / "plots" / "evidence_reliability.png"
 class Examples(NamedTuple):
     """Best right and best wrong modes of pairs.
 
-    `numbers` `(n, 3)` are log gain, near and patch, `right` `(n,)` 1 or 0, `pair`
+    `numbers` `(n, 3)` are log gain, near and firm, `right` `(n,)` 1 or 0, `pair`
     `(n,)` the place of the pair in its kind.
     """
 
@@ -79,49 +78,50 @@ def main() -> None:
 
 def discriminants(examples: dict[str, Examples]) -> Iterator[str]:
     """Found on one half, checked on the other; and without one kind after another."""
-    choose = [x if k in GENERATED else x.of_half(0) for k, x in examples.items()]
-    check = {k: x.of_half(1) for k, x in examples.items() if k not in GENERATED}
-    found = fitted(choose)
-    code = evidence._GAIN, evidence._NEAR, evidence._FALL, -evidence._OFFSET
-    yield "| | log gain | near | patch | offset | examples | loss | AUC |"
+    told = {k: x for k, x in examples.items() if k not in CHECKED}
+    choose = [x if k in GENERATED else x.of_half(0) for k, x in told.items()]
+    check = [x.of_half(1) for k, x in told.items() if k not in GENERATED]
+    unseen = [x for k, x in examples.items() if k in CHECKED]
+    every, found = list(told.values()), fitted(choose)
+    code = evidence._GAIN, evidence._NEAR, evidence._FIRM, -evidence._OFFSET
+    yield "| | log gain | near | firm | offset | examples | loss | AUC |"
     yield "|---|---|---|---|---|---|---|---|"
-    every, second = _joined(examples.values()), _joined(check.values())
-    for name, numbers, told in (
-        ("found on the first half", found, _joined(choose)),
-        ("checked on the second", found, second),
+    for name, numbers, kinds in (
+        ("found on the first half", found, choose),
+        ("checked on the second", found, check),
+        ("checked on other views", found, unseen),
         ("in the code, all", code, every),
-        ("in the code, second half", code, second),
-        ("without patch, second half", (*code[:2], 0, code[3]), second),
-        ("found on all", fitted(list(examples.values())), every),
+        ("in the code, second half", code, check),
+        ("in the code, other views", code, unseen),
+        ("found on all", fitted(every), every),
     ):
-        four = " | ".join(f"{x:.1f}" for x in numbers)
-        yield f"| {name} | {four} | {len(told.right)} | {_quality(numbers, told)} |"
+        if kinds:
+            four = " | ".join(f"{x:.1f}" for x in numbers)
+            count = sum(len(x.right) for x in kinds)
+            yield f"| {name} | {four} | {count} | {_quality(numbers, kinds)} |"
     yield "\n| found without | right, wrong | loss | AUC | right above the best wrong |"
     yield "|---|---|---|---|---|"
-    apart = []
-    for kind, told in examples.items():
-        numbers = fitted([x for k, x in examples.items() if k != kind])
-        scores = _scores(numbers, told)
-        apart.append((scores, told.right))
-        sizes = f"{told.right.sum():.0f}, {(1 - told.right).sum():.0f}"
-        above = _above(scores, told.right)
-        yield f"| {kind} | {sizes} | {_quality(numbers, told)} | {above} |"
-    scores, right = (np.concatenate(x) for x in zip(*apart, strict=True))
-    sizes = f"{right.sum():.0f}, {(1 - right).sum():.0f}"
-    told = f"{_loss(scores, right):.3f} | {_auc(scores, right)}"
-    yield f"| all of these | {sizes} | {told} | {_above(scores, right)} |\n"
+    for kind, own in examples.items():
+        numbers = fitted([x for k, x in told.items() if k != kind])
+        sizes = f"{own.right.sum():.0f}, {(1 - own.right).sum():.0f}"
+        above = _above(_scores(numbers, own), own.right)
+        yield f"| {kind} | {sizes} | {_quality(numbers, [own])} | {above} |"
 
 
-def fitted(examples: list[Examples]) -> np.ndarray:
-    """`(4,)` weights of the numbers and the offset, by logistic regression."""
-    told = _joined(examples)
+def fitted(kinds: list[Examples]) -> np.ndarray:
+    """`(4,)` weights of the numbers and the offset, by logistic regression.
+
+    Kinds count alike, whatever the number of their examples.
+    """
+    told, weight = _joined(kinds), _alike(kinds)
     mean, width = told.numbers.mean(axis=0), told.numbers.std(axis=0)
     rows = np.column_stack([(told.numbers - mean) / width, np.ones(len(told.right))])
     sign = 2 * told.right - 1
 
     def loss(b: np.ndarray) -> float:
         # A slight pull to zero: halves may be separable.
-        return np.logaddexp(0, -sign * (rows @ b)).sum() + 0.05 * np.sum(b[:-1] ** 2)
+        pull = 0.05 * np.sum(b[:-1] ** 2)
+        return weight @ np.logaddexp(0, -sign * (rows @ b)) + pull
 
     b = minimize(loss, np.zeros(rows.shape[1]), method="BFGS").x
     slope = b[:-1] / width
@@ -202,10 +202,8 @@ def _examples(rows: list[dict[str, Any]]) -> Examples:
 
 
 def _slides(row: dict[str, Any]) -> bool:
-    """Whether the answer is ambiguous without a rival: its surfaces do not hold it."""
-    first, *others = (mode["log_evidence"] for mode in row["modes"])
-    rival = any(other > first - RIVAL_MARGIN for other in others)
-    return row["status"] == "AMBIGUOUS" and not rival
+    """Whether the surfaces that agree in the answer do not hold it."""
+    return not row["modes"][0]["holds"]
 
 
 def _is_right(mode: dict[str, float]) -> bool:
@@ -224,8 +222,10 @@ def _scores(numbers: Any, told: Examples) -> np.ndarray:
     return told.numbers @ np.asarray(numbers[:-1]) + numbers[-1]
 
 
-def _loss(scores: np.ndarray, right: np.ndarray) -> float:
-    return float(np.logaddexp(0, -(2 * right - 1) * scores).mean())
+def _alike(kinds: list[Examples]) -> np.ndarray:
+    """Weights of one on average, by which kinds count alike."""
+    share = np.concatenate([np.full(len(x.right), 1 / len(x.right)) for x in kinds])
+    return share / share.mean()
 
 
 def _auc(scores: np.ndarray, right: np.ndarray) -> str:
@@ -241,9 +241,11 @@ def _above(scores: np.ndarray, right: np.ndarray) -> str:
     return f"{(scores[right == 1] > best).mean():.2f}" if right.any() else "-"
 
 
-def _quality(numbers: Any, told: Examples) -> str:
+def _quality(numbers: Any, kinds: list[Examples]) -> str:
+    told = _joined(kinds)
     scores = _scores(numbers, told)
-    return f"{_loss(scores, told.right):.3f} | {_auc(scores, told.right)}"
+    loss = _alike(kinds) @ np.logaddexp(0, -(2 * told.right - 1) * scores)
+    return f"{loss / len(scores):.3f} | {_auc(scores, told.right)}"
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from jaxreg.registrar import prepare_pair
 
 
 #: What evidence is made of.
-NUMBERS = "log_gain", "near", "patch"
+NUMBERS = "log_gain", "near", "firm"
 # Sizes that clouds are padded to: each is compiled once.
 _SIZES = 8192, 32768, 49152, 98304, 327680
 
@@ -37,10 +37,10 @@ def modes_of(pair: Pair, key: int) -> dict[str, Any]:
     T = found.modes.T_target_source
     numbers = found.modes.log_evidence, *_numbers(clouds, T)
     told = zip(*map(np.asarray, numbers), strict=True)
-    names = "log_evidence", *NUMBERS, "degrees", "tolerances"
+    names = "log_evidence", *NUMBERS, "holds", "degrees", "tolerances"
     modes = [
-        dict(zip(names, map(float, (*four, *pair.errors(pose))), strict=True))
-        for four, pose, weight in zip(
+        dict(zip(names, map(float, (*five, *pair.errors(pose))), strict=True))
+        for five, pose, weight in zip(
             told, np.asarray(T, float), np.asarray(found.modes.weight), strict=True
         )
         if weight > 0
@@ -69,7 +69,7 @@ def padded(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, ...]:
 
 @eqx.filter_jit
 def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, ...]:
-    """`(q,)` the numbers of poses `(q, 4, 4)`, as the evidence has them."""
+    """`(q,)` the numbers of poses `(q, 4, 4)`, as the evidence has them, and holds."""
     ready = prepare_pair(ParticleFilter(), tuple(map(jnp.asarray, clouds)))
     index = BruteForce.build(ready.target.points, ready.target.mask)
     witness = Prepared.of(ready.source, ready.target, index).judged.exact.witness
@@ -82,6 +82,7 @@ def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, ...]:
         )
         gain = jnp.maximum((to.gain + fro.gain) / 2, evidence._LEAST_GAIN)
         near = jnp.sqrt(to.near * fro.near)
-        return jnp.log(gain), near, evidence._patch(to, fro)
+        firm = to.grip.firmness(witness.radius) + fro.grip.firmness(witness.radius)
+        return jnp.log(gain), near, firm / 2, to.grip.holds
 
     return lax.map(of_pose, jax.vmap(ready.frames.enter)(T))

@@ -120,6 +120,15 @@ def inverse_semidefinite(A: Float[Array, "*b k k"]) -> Float[Array, "*b k k"]:
     return _stacked(rows)
 
 
+def log_det(A: Float[Array, "*b k k"]) -> Float[Array, "*b"]:
+    """Logarithms of the determinants of positive definite matrices.
+
+    The lower triangles are read.
+    """
+    _, pivots = _factors(A)
+    return -sum((jnp.log(p) for p in pivots[1:]), jnp.log(pivots[0]))
+
+
 def root_semidefinite(
     A: Float[Array, "*b k k"], b: Float[Array, "*b k"]
 ) -> tuple[Float[Array, "*b k k"], Float[Array, "*b k"]]:

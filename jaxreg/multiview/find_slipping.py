@@ -35,7 +35,7 @@ def slipping(
     Args:
         scans: prepared scans.
         placement: their final poses.
-        least: log evidence of the pairs that count.
+        least: log evidence of the surfaces of pairs that count (`Evidence.contact`).
         pairs: those that may overlap (`near_pairs`).
         held: scans that are one body from the start, None if there are none.
     """
@@ -65,7 +65,7 @@ def _grips(
         T_i_j = lie.between(T_world_i[i], T_world_i[j])
         witness = scans.witness(i, j)
         found = witness.of_pose(T_i_j)
-        use = (found.log_evidence >= least) & placement.together(i, j) & (i != j)
+        use = (found.contact >= least) & placement.together(i, j) & (i != j)
         grip = jax.tree.map(lambda x: jnp.where(use, x, 0), found.grip)
         return grip.seen_from(T_world_i[i])
 

@@ -43,7 +43,7 @@ def test_less_fits_less_likely():
     rng = np.random.default_rng(0)
     for noise in (0.02, 0.05, 0.1, 0.2):
         told.append(_told(floor(0) + [0, 0, 1] * rng.normal(0, noise, (256, 1))))
-    evidence = [float(x.log_evidence) for x in told]
+    evidence = [float(x.contact) for x in told]
     assert evidence == sorted(evidence, reverse=True)
     assert evidence[-1] < 0 < evidence[0]
 
@@ -51,8 +51,8 @@ def test_less_fits_less_likely():
 def test_points_over_and_under_the_other_surface_speak_against_a_pose():
     parted = np.concatenate([floor(0)[:128], floor(0.2)[128:]])
     alone = floor(0)[:128]
-    both = float(_told(parted).log_evidence)
-    assert both < 0 < float(_told(alone, UP[:128]).log_evidence)
+    both = float(_told(parted).contact)
+    assert both < 0 < float(_told(alone, UP[:128]).contact)
 
 
 def test_normals_that_cross_are_chance():
@@ -165,6 +165,24 @@ def _balance(normals: np.ndarray) -> np.ndarray:
     return 1 / np.maximum(density, 1 / len(normals))
 
 
+def _firmness(source: PointCloud, target: PointCloud) -> float:
+    """Mean of both ways in float64, of the points that lie within a fifth."""
+    clouds = [(np.asarray(x.points), np.asarray(x.normals)) for x in (source, target)]
+    radius = min(np.sqrt(((p - p.mean(0)) ** 2).sum(1).mean()) for p, _ in clouds)
+    found = []
+    for (p, _), (q, m) in (clouds, clouds[::-1]):
+        distance, row = KDTree(q).query(p)
+        reach = KDTree(q).query(q, 5)[0][:, 1:].mean(1)[row]
+        height = np.abs(np.sum(m[row] * (q[row] - p), axis=1))
+        on = (distance < reach) & (height < 0.2 * reach)
+        x = (p[on] - p[on].mean(0)) / radius
+        J = np.concatenate([m[row][on], np.cross(x, m[row][on])], axis=1)
+        moved = np.linalg.eigvalsh(J.T @ J / len(J)) + 0.02**2
+        most = np.array([1 / 3] * 3 + [2 / 9] * 3)
+        found.append(np.log(moved / most).sum() / 2)
+    return np.mean(found)
+
+
 def test_evidence_agrees_with_an_oracle_in_float64(scans):
     source, target = (
         PointCloud(x.points[x.mask], x.normals[x.mask], x.mask[x.mask]) for x in scans
@@ -172,9 +190,17 @@ def test_evidence_agrees_with_an_oracle_in_float64(scans):
     gain_a, near_a = _oracle(source, target)
     gain_b, near_b = _oracle(target, source)
     log_gain = np.log((gain_a + gain_b) / 2)
-    expected = 2.3 * log_gain + 38 * np.sqrt(near_a * near_b) - 34.8
     found = witness(source, target).of_pose(EYE)
-    np.testing.assert_allclose(found.log_evidence, expected, atol=0.05)
+    firm = _firmness(source, target)
+    expected = 4 * log_gain + 28 * np.sqrt(near_a * near_b) + 1.8 * firm - 23.3
+    np.testing.assert_allclose(found.log_evidence, expected, atol=0.1)
+    expected = 2.3 * log_gain + 38 * np.sqrt(near_a * near_b) - 34.8
+    np.testing.assert_allclose(found.contact, expected, atol=0.1)
+
+
+def test_a_wall_on_a_wall_is_in_contact_and_tells_no_pose():
+    told = _told(floor(0, shift=SPACING / 2))
+    assert float(told.log_evidence) < 0 < float(told.contact)
 
 
 def test_masked_points_say_nothing():
@@ -197,7 +223,7 @@ def test_points_that_the_other_scanner_looked_through_speak_against_a_pose():
     eye = jnp.array([0.75, 0.75, 3.0])
     source = as_cloud(ahead, np.tile([0.0, 0.0, 1.0], (260, 1)))
     plain, seen = (
-        float(witness(source, target).of_pose(EYE).log_evidence)
+        float(witness(source, target).of_pose(EYE).contact)
         for target in (wall, wall.seen_from(eye))
     )
     assert seen < 0 < plain

@@ -68,3 +68,33 @@ def test_a_grip_holds_if_its_least_eigenvalue_is_large(seed):
     for seen in (grip, grip.seen_from(T)):
         if abs(least - 0.07) > 1e-4:
             assert bool(seen.holds) == (least > 0.07)
+
+
+@given(st.integers(0, 1000), st.floats(0.1, 10.0))
+@settings(max_examples=20, deadline=None)
+def test_firmness_is_a_log_determinant_in_any_frame_and_unit(seed, unit):
+    rng = np.random.default_rng(seed)
+    points = rng.standard_normal((16, 3)) * rng.uniform(0.2, 1, 3)
+    normals = rng.standard_normal((16, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    x = points - points.mean(0)
+    J = np.concatenate([normals, np.cross(x, normals)], axis=1)
+    moved = np.linalg.eigvalsh(J.T @ J / 16) + 0.02**2
+    expected = np.log(moved / np.array([1 / 3] * 3 + [2 / 9] * 3)).sum() / 2
+    grip = _grip(unit * points, normals)
+    T = jnp.asarray(motion(seed, 3), jnp.float32)
+    for seen in (grip, grip.seen_from(T)):
+        found = seen.firmness(jnp.float32(unit))
+        np.testing.assert_allclose(found, min(expected, 0), atol=2e-3)
+
+
+def test_what_slips_is_hardly_firm_and_planes_all_round_are_firmest():
+    rng = np.random.default_rng(0)
+    x, n = rng.standard_normal((2, 2000, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    one = jnp.float32(1)
+    firmest = float(_grip(x, n).firmness(one))
+    assert -0.05 < firmest <= 0
+    sphere = float(_grip(x, x).firmness(one))
+    assert sphere < -9  # three turns of 0.02 in place of 0.47

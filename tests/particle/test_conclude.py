@@ -6,7 +6,7 @@ import pytest
 
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.matching.slippage import Grip
-from jaxreg.particle.conclude import _convincing, _has_rival, _weights
+from jaxreg.particle.conclude import LEAST_ODDS, _convincing, _log_odds, _weights
 
 
 def _weighed(*log_evidence: float) -> np.ndarray:
@@ -32,22 +32,20 @@ def test_modes_in_use_keep_some_weight_and_the_others_none():
 
 
 @pytest.mark.parametrize(
-    ("log_evidence", "holds", "rival"),
+    ("log_evidence", "stands_out"),
     [
-        ((5.0, 4.4), (True, True), False),
-        ((5.0, 4.6), (True, True), True),
-        ((5.0, NO_EVIDENCE), (True, False), False),
-        # What slides along a wall rivals no pose that is held, but one that slides.
-        ((5.0, 4.6), (True, False), False),
-        ((5.0, 4.6, 4.7), (True, False, True), True),
-        ((5.0, 4.6), (False, False), True),
+        ((5.0, 3.9), True),
+        ((5.0, 4.1), False),
+        ((5.0, NO_EVIDENCE), True),
+        ((5.0,), True),
+        # Two that fit worse are together a rival.
+        ((5.0, 3.5, NO_EVIDENCE), True),
+        ((5.0, 3.5, 3.5), False),
     ],
 )
-def test_a_mode_is_a_rival_if_it_is_nearly_as_likely_and_holds(
-    log_evidence, holds, rival
-):
-    found = _has_rival(jnp.asarray(log_evidence, jnp.float32), jnp.asarray(holds))
-    assert bool(found) == rival
+def test_modes_count_together_against_the_first(log_evidence, stands_out):
+    found = _log_odds(jnp.asarray(log_evidence, jnp.float32))
+    assert bool(found >= LEAST_ODDS) == stands_out
 
 
 @pytest.mark.parametrize(
