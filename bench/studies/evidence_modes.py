@@ -82,7 +82,7 @@ def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, ...]:
         )
         gain = jnp.maximum((to.gain + fro.gain) / 2, evidence._LEAST_GAIN)
         near = jnp.sqrt(to.near * fro.near)
-        firm = to.grip.firmness(witness.radius) + fro.grip.firmness(witness.radius)
-        return jnp.log(gain), near, firm / 2, to.grip.holds
+        firm = [x.grip.firmness(witness.radius) for x in (to, fro)]
+        return jnp.log(gain), near, jnp.minimum(*firm), to.grip.holds
 
     return lax.map(of_pose, jax.vmap(ready.frames.enter)(T))

@@ -20,8 +20,8 @@ numbers of both ways are left,
     near    the share of the points beside that are within one spacing of the plane:
             surfaces that touch by chance part again,
     firm    how firmly the points on the surface hold the pose, the logarithm of a
-            volume of motions (`Grip.firmness`): what holds loosely, a wall or a small
-            patch, fits in many wrong poses.
+            volume of motions (`Grip.firmness`), the looser of both ways: what holds
+            loosely, a wall or a small patch, fits in many wrong poses.
 
 The logarithm of the odds of a right pose against the best wrong one is taken to be
 linear in them (logistic regression on pairs of scans):
@@ -44,9 +44,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
 from jaxreg._core.arrays import on_both
+from jaxreg._core.quantile import masked_quantile
 from jaxreg._core.shares import shared
 from jaxreg._core.typing import Motion, Scalar
-from jaxreg.cloud import PointCloud, levelled, rms_radius
+from jaxreg.cloud import PointCloud, centroid, levelled
 from jaxreg.geometry import lie
 from jaxreg.matching.chance import near_by_chance
 from jaxreg.matching.directions import balanced
@@ -122,7 +123,7 @@ class Witness(eqx.Module):
         shares: weights by which the directions of either's normals count alike.
         chance: share of the heights beside that is near by chance, of the cloud that
             has less of it.
-        radius: root mean square, of the smaller cloud.
+        radius: median distance from the middle, of the smaller cloud.
     """
 
     problems: tuple[Problem, Problem]
@@ -241,7 +242,7 @@ def _of_both(
 ) -> Evidence:
     gain = jnp.maximum((there.gain + back.gain) / 2, _LEAST_GAIN)
     near = _root(there.near * back.near)
-    firm = (there.grip.firmness(radius) + back.grip.firmness(radius)) / 2
+    firm = jnp.minimum(there.grip.firmness(radius), back.grip.firmness(radius))
     gain = jnp.log(gain)
     log_evidence = _GAIN * gain + _NEAR * near + _FIRM * firm - _OFFSET
     contact = _CONTACT_GAIN * gain + _CONTACT_NEAR * near - _CONTACT_OFFSET
@@ -257,8 +258,14 @@ def _of_both(
 
 
 def _smaller_radius(source: PointCloud, target: PointCloud) -> Scalar:
-    radii = [rms_radius(x.points, x.mask) for x in (source, target)]
-    least = jnp.minimum(*radii)
+    """Of half the points: a lidar that sees far has few of its points there."""
+
+    def radius(cloud: PointCloud) -> Scalar:
+        away = cloud.points - centroid(cloud.points, cloud.mask)
+        sq = jnp.sum(jnp.where(cloud.mask[:, None], away, 0) ** 2, axis=1)
+        return _root(masked_quantile(sq, cloud.mask, 0.5))
+
+    least = jnp.minimum(radius(source), radius(target))
     return jnp.where(least > 0, least, 1)
 
 
