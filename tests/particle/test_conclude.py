@@ -4,9 +4,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.matching import NO_EVIDENCE
+from jaxreg.matching import NO_EVIDENCE, Evidence
 from jaxreg.matching.slippage import Grip
-from jaxreg.particle.conclude import LEAST_ODDS, _convincing, _log_odds, _weights
+from jaxreg.particle.conclude import (
+    LEAST_ODDS,
+    _Candidates,
+    _convincing,
+    _log_odds,
+    _weights,
+)
 
 
 def _weighed(*log_evidence: float) -> np.ndarray:
@@ -58,3 +64,26 @@ def test_proposals_count_if_they_share_enough_and_hold(overlap, held, counts):
     grip = Grip(*(jnp.asarray(x, jnp.float32) for x in (H, np.zeros(3), 1.0)))
     found = _convincing(jnp.asarray([overlap]), grip.holds[None])
     np.testing.assert_array_equal(found, [counts])
+
+
+@pytest.mark.parametrize(
+    ("holds", "told"),
+    [((False, True), (-3.0, -2.0)), ((False, False), (4.0, 1.0))],
+)
+def test_contact_is_what_is_told_where_surfaces_hold_no_pose(holds, told):
+    zero = jnp.zeros(2, jnp.float32)
+    log_evidence, contact = (
+        jnp.asarray(x, jnp.float32) for x in ((-3.0, -2.0), (4.0, 1.0))
+    )
+    grip = Grip(jnp.zeros((2, 6, 6)), jnp.zeros((2, 3)), zero)
+    evidence = Evidence(
+        log_evidence, contact, zero, zero, zero, jnp.zeros(2, jnp.int32), grip
+    )
+    found = _Candidates(
+        jnp.tile(jnp.eye(4), (2, 1, 1)),
+        zero,
+        jnp.ones(2, bool),
+        evidence,
+        jnp.asarray(holds),
+    )
+    np.testing.assert_array_equal(found.log_evidence, np.float32(told))
