@@ -83,8 +83,9 @@ def status_of(
 ) -> Int[Array, ""]:
     """Of the answer `T`, from that of the loop; the most serious last."""
     status = jnp.where(free, Status.DEGENERATE, status)
-    # Steps that have run out say so first: more of them may find evidence.
-    unlikely = evidence.log_evidence < LIKELY
+    # Steps that have run out say so first: more of them may find evidence. A pose from
+    # a guess is one of few: whether surfaces coincide is asked, not what holds them.
+    unlikely = evidence.contact < LIKELY
     unlikely &= (status != Status.MAX_STEPS) | (evidence.overlap == 0)
     status = jnp.where(unlikely, Status.LOW_OVERLAP, status)
     status = jnp.where(worse, Status.DIVERGED, status)

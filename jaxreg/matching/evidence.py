@@ -261,7 +261,7 @@ def _smaller_radius(source: PointCloud, target: PointCloud) -> Scalar:
     """Of half the points: a lidar that sees far has few of its points there."""
 
     def radius(cloud: PointCloud) -> Scalar:
-        away = cloud.points - centroid(cloud.points, cloud.mask)
+        away = cloud.points - centroid(cloud.points, cloud.mask)[None]
         sq = jnp.sum(jnp.where(cloud.mask[:, None], away, 0) ** 2, axis=1)
         return _root(masked_quantile(sq, cloud.mask, 0.5))
 

@@ -78,7 +78,11 @@ class Grip(eqx.Module):
         H = self._mean()
         k, d = H.shape[-1], self.x.shape[-1]
         unit = jnp.where(jnp.arange(k) < d, 1, radius)
-        H = H / unit[:, None] / unit + _FREE**2 * jnp.eye(k, dtype=H.dtype)
+        free = _FREE**2 * jnp.eye(k, dtype=H.dtype)
+        units, free = (
+            jnp.broadcast_to(x, H.shape) for x in (jnp.outer(unit, unit), free)
+        )
+        H = H / units + free
         return jnp.minimum(small.log_det(H) / 2 - _FIRMEST[k], 0)
 
     def _mean(self) -> Float[Array, "*b k k"]:
