@@ -93,16 +93,18 @@ class ParticleFilter(AbstractFilter):
             shifts by more than so many radii (the target's root mean square radius):
             then the diffusion has died.
         min_log_evidence: of less `log_evidence` than this the status is LOW_OVERLAP. At
-            the default 269 of 280 right answers were believed, and none of 128 wrong
-            ones (bench/studies/evidence.md).
+            the default 269 of 280 right answers were believed and none of 128 wrong
+            ones, but of views of walls 127 right and 6 wrong ones
+            (bench/studies/evidence.md).
 
     Raises: ValueError while constructing, for counts that leave nothing to do; for
     points of another dimension than `dim`.
 
     Fails: TOO_FEW_POINTS; NON_FINITE where no energy is finite; LOW_OVERLAP where the
-    evidence is below `min_log_evidence`; AMBIGUOUS where a second mode is as likely,
-    unless it can slip, or where the surfaces that agree can slip, as those of a
-    cylinder; without refinement MAX_STEPS where the diffusion had not died.
+    evidence is below `min_log_evidence`; AMBIGUOUS where the first mode does not stand
+    above all others together by log odds of 1, or where the surfaces that agree can
+    slip, as those of a cylinder; without refinement MAX_STEPS where the diffusion had
+    not died.
 
     Gradients: of the poses by every point of both clouds, by the balance of pulls at
     the last steps (implicit function theorem), in forward and reverse mode; held is

@@ -42,8 +42,9 @@ class MultiStart(AbstractSearch):
             and shifts none by more than so many radii (the target's root mean square
             radius).
         min_log_evidence: of less `log_evidence` than this the status is LOW_OVERLAP. At
-            the default 269 of 280 right answers were believed, and none of 128 wrong
-            ones (bench/studies/evidence.md).
+            the default 269 of 280 right answers were believed and none of 128 wrong
+            ones, but of views of walls 127 right and 6 wrong ones
+            (bench/studies/evidence.md).
 
     Raises: ValueError while constructing, for counts that leave nothing to do.
 
