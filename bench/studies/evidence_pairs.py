@@ -87,7 +87,7 @@ def views(data: Path) -> Iterator[Pair]:
 
 
 def other_views(data: Path) -> Iterator[Pair]:
-    """Of other cameras, which nothing was found on."""
+    """Of other cameras, to which no weight was fitted."""
     yield from _views(data, 7)
 
 

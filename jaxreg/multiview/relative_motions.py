@@ -63,9 +63,8 @@ class RelativeMotions(BriefModule):
     def log_odds(self) -> Float[Array, "*e m"]:
         """`(e, m)` of each mode against all others and against none being right.
 
-        At equal odds before. Of pairs of views of a room, many of little but a wall, 26
-        of 28 first modes of log odds above 1 were right, and 52 of 146 of log evidence
-        above 2 (bench/studies/evidence.md).
+        At equal odds before. How often modes of such odds are right, and of such log
+        evidence alone: bench/studies/evidence.md.
         """
         one_more = jnp.pad(jnp.asarray(self.log_evidence), ((0, 0), (0, 1)))
         own = jnp.eye(self.num_modes, self.num_modes + 1, dtype=bool)

@@ -27,11 +27,9 @@ from jaxreg.robust import AbstractKernel
 #: Poses nearer than this, in radians and radii, are one mode.
 APART = 0.3
 #: Log odds of the first mode against all others together, below which it is one of
-#: several: at these, with equal odds before, one answer in four would be wrong. (Of 276
-#: pairs of views of a room, many of little but a wall, 106 have evidence and hold, 53
-#: of them wrong; 29 stand out so, one of them wrong. Poses that a symmetry makes equal
-#: differ by 0.25 at most, in 108 pairs of cubes, boxes, prisms and tori of 500 to 4,000
-#: points, with noise or not.)
+#: several: at these, with equal odds before, one answer in four would be wrong. (Judged
+#: with patches in place of firmness, of 276 pairs of views of a room 106 had evidence
+#: and held, 53 of them wrong; 29 stood out so, one of them wrong.)
 LEAST_ODDS = 1.0
 # Proposals that share less of the source are not judged.
 _LEAST_SHARED = 1 / 7
@@ -270,8 +268,8 @@ def _convincing(
 def _log_odds(log_evidence: Float[Array, " q"]) -> Scalar:
     """Of the first mode against all others together, at equal odds before.
 
-    Others count also where they can slip: of 12 pairs of views of a room that stand out
-    but for such walls on walls, 5 lie wrong.
+    Others count also where they can slip: judged with patches in place of firmness, of 12
+    pairs of views of a room that stood out but for such walls on walls 5 lay wrong.
     """
     others = jnp.append(log_evidence[1:], NO_EVIDENCE)
     return log_evidence[0] - jax.nn.logsumexp(others)
