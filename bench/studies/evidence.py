@@ -130,7 +130,8 @@ def fitted(kinds: list[Examples]) -> np.ndarray:
 
 def choices(rows: dict[str, list[dict[str, Any]]]) -> Iterator[str]:
     """Whether the mode of most evidence is right, where one of the modes is."""
-    yield "\n| answers | with a right mode | it is the first | believed | wrong of them |"
+    yield ""
+    yield "| answers | with a right mode | it is the first | believed | wrong of them |"
     yield "|---|---|---|---|---|"
     total = np.zeros(5, int)
     for kind, found in rows.items():

@@ -268,8 +268,8 @@ def _convincing(
 def _log_odds(log_evidence: Float[Array, " q"]) -> Scalar:
     """Of the first mode against all others together, at equal odds before.
 
-    Others count also where they can slip: judged with patches in place of firmness, of 12
-    pairs of views of a room that stood out but for such walls on walls 5 lay wrong.
+    Others count also where they can slip: judged with patches in place of firmness, of
+    12 pairs of views of a room that stood out but for such walls on walls 5 lay wrong.
     """
     others = jnp.append(log_evidence[1:], NO_EVIDENCE)
     return log_evidence[0] - jax.nn.logsumexp(others)
