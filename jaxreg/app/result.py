@@ -56,8 +56,8 @@ class Result:
         aligned: files of whole scans in the common frame.
         fixed: names of scans whose poses were held.
         known: of each control point or level `kind`, `frame`, `weight`, and how far it
-            is off, `translation` or `rotation`; None where the frame is that of the
-            first scan.
+            is off, `translation` or `rotation`, as result.schema.json says; None where
+            the frame is that of the first scan.
         covariances: `(v, k, k)` of the poses relative to the first scan of their
             component, as `scan_covariances` gives them; None if there are too many.
     """
@@ -138,7 +138,7 @@ class Result:
         T[i], T[j] = np.eye(T.shape[-1]), self.T_i_j[row]
         component = np.full(len(self.names), -1)
         component[[i, j]] = 0
-        return replace(self, T_world_i=T, component=component, attempt=True)
+        return replace(self, T_world_i=T, component=component, attempt=True, known=None)
 
     def best_pair(self, scan: int) -> int | None:
         """The row of the pair of this scan that overlaps most, None without pairs."""

@@ -11,6 +11,7 @@ from rich.table import Table
 from jaxreg.app.cli.guess import read_guess
 from jaxreg.app.cli.options import Average, KnownOptions, Multiview
 from jaxreg.app.cli.runtime import Session
+from jaxreg.app.result import Result
 from jaxreg.averaging import AveragingSolution, EdgeReport
 from jaxreg.io.errors import InputError
 from jaxreg.io.files import text_lines
@@ -73,21 +74,49 @@ def of_middles(known: KnownOfGraph, middles: np.ndarray) -> KnownOfGraph:
 
 
 def known_of_scans(
-    known: KnownOfGraph, T_world_i: np.ndarray, trust: Any, names: list[str]
+    known: KnownOfGraph, result: Result, trust: Any
 ) -> list[dict[str, Any]]:
     """How far control points and levels are off, and their trust, for result.json."""
     entries = []
+    # Other components do not lie in the world.
+    T_world_i = np.where(result.placed[:, None, None], result.T_world_i, np.nan)
     rows = [("control", *row) for row in known.control]
     rows += [("level", *row) for row in known.levels]
-    for weight, (kind, frame, x, y, *_) in zip(np.asarray(trust), rows, strict=True):
-        R, t = T_world_i[frame][:-1, :-1], T_world_i[frame][:-1, -1]
+    for weight, (kind, frame, x, *told) in zip(np.asarray(trust), rows, strict=True):
+        T = T_world_i[frame]
         if kind == "control":
-            off = {"translation": float(np.linalg.norm(R @ x + t - y))}
+            off = control_entry(T, x, *told)
         else:
-            off = {"rotation": tilt(R, x)}
-        name = names[frame]
+            off = {"rotation": tilt(T[:-1, :-1], x)}
+        name = result.names[frame]
         entries.append({"kind": kind, "frame": name, "weight": float(weight)} | off)
     return entries
+
+
+def control_entry(
+    T_world_i: np.ndarray,
+    point: np.ndarray,
+    surveyed: np.ndarray,
+    information: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """How far a pose puts a point from where it was surveyed, for result.json.
+
+    `residual` is along the axes of the world, None where the pose is NaN, and
+    `normalised_residual`, in standard deviations, None where these are not known.
+    """
+    T = np.asarray(T_world_i, np.float64)
+    off = T[:-1, :-1] @ point + T[:-1, -1] - surveyed
+    normalised = None
+    if information is not None:
+        normalised = np.sqrt(off @ information @ off / len(off))
+    placed = bool(np.isfinite(off).all())
+    return {
+        "point": np.asarray(point).tolist(),
+        "surveyed": np.asarray(surveyed).tolist(),
+        "residual": off.tolist() if placed else None,
+        "translation": float(np.linalg.norm(off)),
+        "normalised_residual": None if normalised is None else float(normalised),
+    }
 
 
 def tilt(R: np.ndarray, up: np.ndarray) -> float:
@@ -197,23 +226,22 @@ def known_entries(
     if sol.prior_weight is None:
         return []
     rows = {"prior": known.priors, "control": known.control, "level": known.levels}
-    kinds = [(kind, row[0]) for kind, some in rows.items() for row in some]
+    kinds = [(kind, row) for kind, some in rows.items() for row in some]
     first = len(report.edges) - len(kinds)
     weights = np.asarray(sol.prior_weight)
-    return [
-        {
-            "kind": kind,
-            "frame": int(ids[frame]),
-            "weight": float(weights[n]),
-            **(
-                {"rotation": float(report.rotation[first + n])}
-                if kind == "level"
-                else {"translation": float(report.translation[first + n])}
-            ),
-            "normalised_residual": float(report.normalised[first + n]),
-        }
-        for n, (kind, frame) in enumerate(kinds)
-    ]
+    placed = np.asarray(sol.placed)[:, None, None]
+    T_world_i = np.where(placed, np.asarray(sol.T_world_i), np.nan)
+    entries = []
+    for n, (kind, row) in enumerate(kinds):
+        off = {"translation": float(report.translation[first + n])}
+        if kind == "level":
+            off = {"rotation": float(report.rotation[first + n])}
+        if kind == "control":
+            off = control_entry(T_world_i[row[0]], *row[1:])
+        entry = {"kind": kind, "frame": int(ids[row[0]]), "weight": float(weights[n])}
+        normalised = {"normalised_residual": float(report.normalised[first + n])}
+        entries.append(entry | off | normalised)
+    return entries
 
 
 def show_known(

@@ -232,7 +232,7 @@ def reconstruct_scans(
     )
     if not in_world:
         return result
-    entries = known_of_scans(known, T_world_i, sol.prior_weight, result.names)
+    entries = known_of_scans(known, result, sol.prior_weight)
     held = tuple(result.names[frame] for frame, _ in known.fixed)
     return dataclasses.replace(result, fixed=held, known=entries)
 

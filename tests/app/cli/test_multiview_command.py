@@ -175,6 +175,11 @@ def test_fixed_scans_and_control_points_are_those_of_the_files(
     assert found["fixed"] == ["s1"]
     np.testing.assert_allclose(found["scans"][2]["covariance"], 1e-6 * np.eye(6))
     assert [row["frame"] for row in found["known"]] == ["s2"] * 3 + ["s0"]
+    point = found["known"][1]
+    np.testing.assert_allclose(point["point"], seen[1])
+    np.testing.assert_allclose(point["surveyed"], lies[1])
+    assert point["translation"] == pytest.approx(np.linalg.norm(point["residual"]))
+    assert point["normalised_residual"] < 1e-3 / 0.01
     assert found["known"][3]["kind"] == "level"
     assert found["known"][3]["rotation"] < 1e-4
     assert "Priors, control points and levels" in capsys.readouterr().out

@@ -263,6 +263,13 @@ def test_average_goes_into_the_frame_of_what_is_known(
     )
     assert found["fixed"] == [1]
     assert [entry["frame"] for entry in found["known"]] == [0, 2, 2]
+    for entry in found["known"]:
+        own = np.array(found["T_world_i"][entry["frame"]]) @ [*entry["point"], 1]
+        off = own[:2] - entry["surveyed"]
+        np.testing.assert_allclose(entry["residual"], off, atol=1e-12)
+        assert entry["normalised_residual"] == pytest.approx(
+            np.linalg.norm(off) / 0.1 / np.sqrt(2)
+        )
     assert "Priors, control points and levels" in capsys.readouterr().out
     again = jaxreg.io.read_g2o_known("jaxreg-out/graph.g2o")
     assert [frame for frame, _ in again.fixed] == [1]
