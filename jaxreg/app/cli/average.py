@@ -164,6 +164,7 @@ def _write(
                 before,
                 ids.tolist(),
                 covariances=_covariances(graph, sol, known),
+                known=entries,
                 details=outputs.page_details(session, document)
                 | {k: document[k] for k in ("objective_before", "objective_after")},
             )

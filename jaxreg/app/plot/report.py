@@ -14,6 +14,7 @@ from jaxreg.app.plot.figure import principal_axes, tilt
 from jaxreg.app.plot.report_curves import trace_curves
 from jaxreg.app.plot.report_page import write_page
 from jaxreg.app.plot.report_parts import (
+    control_rows,
     details_entry,
     deviations,
     error_ellipsoid,
@@ -43,10 +44,10 @@ def write_report(
     """Writes scans and their poses as one HTML page that opens from disk.
 
     The page shows the scans before and after in a view that turns, a cross-section that
-    moves, the pairs with their trust and how far they are off, how the method came to
-    rest, the poses, and how they were made. Components beside the model are shown in
-    turn. It holds at most 64 000 points, 2.5 MB with the drawing library, and loads
-    nothing.
+    moves, control points and how far they are off, the pairs with their trust and how
+    far they are off, how the method came to rest, the poses, and how they were made.
+    Components beside the model are shown in turn. It holds at most 64 000 points,
+    2.5 MB with the drawing library, and loads nothing.
 
         sol = jaxreg.reconstruct(scans, key=key)
         jaxreg.app.plot.write_report("report.html", scans, sol)
@@ -131,6 +132,7 @@ def _page_data(
         "points": encode_points(points),
         "scans": _scan_rows(result, clouds, labels, covariances, errors),
         "pairs": _pair_rows(result),
+        "control": control_rows(result.known, result.names),
         "modes": _mode_rows(modes) if pair and modes is not None else [],
         "errors": None if errors is None else dict(errors),
         "curves": trace_curves(result.trace),

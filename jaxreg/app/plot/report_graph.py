@@ -13,6 +13,7 @@ from jaxreg.app.plot.figure import principal_axes, tilt
 from jaxreg.app.plot.report_curves import trace_curves
 from jaxreg.app.plot.report_page import write_page
 from jaxreg.app.plot.report_parts import (
+    control_rows,
     details_entry,
     deviations,
     floats,
@@ -33,13 +34,14 @@ def write_graph_report(
     names: Sequence[Any] | None = None,
     *,
     covariances: Any = None,
+    known: Sequence[Mapping[str, Any]] = (),
     details: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes an averaged pose graph as one HTML page that opens from disk.
 
-    The page shows the positions and edges before and after, the edges by whether they
-    are trusted and how far they are off, beside the width of the kernel, how the steps
-    came to rest, the poses, and how they were made.
+    The page shows the positions and edges before and after, control points, the edges
+    by whether they are trusted and how far they are off, beside the width of the
+    kernel, how the steps came to rest, the poses, and how they were made.
 
     Args:
         path: the HTML file; it appears whole or not at all.
@@ -49,6 +51,7 @@ def write_graph_report(
         names: of the frames; their numbers by default.
         covariances: `(v, k, k)`; by default, for some hundred frames, those that
             `pose_covariances` gives.
+        known: what `known` of result.json holds of these frames.
         details: as in `write_report`, and `objective_before`, `objective_after`.
 
     Raises:
@@ -58,7 +61,8 @@ def write_graph_report(
     if before is None:
         before = chained(graph, solution)
     num = graph.num_poses
-    labels = [str(x) for x in (range(num) if names is None else names)]
+    ids = range(num) if names is None else names
+    labels = [str(x) for x in ids]
     if covariances is None and num <= MAX_COVARIANCES:
         covariances = jaxreg.pose_covariances(graph, solution)
     sigma = deviations(covariances, num)
@@ -68,6 +72,7 @@ def write_graph_report(
     told = details is not None and "command" in details
     how = _solver_data(solution, told)
     data = {"kind": "graph", "title": title, "dim": graph.dim, **poses, **edges, **how}
+    data["control"] = control_rows(known, ids)
     data["details"] = details_entry(details)
     write_page(path, title, data)
 
@@ -85,6 +90,7 @@ def _pose_data(
     origin = np.median(T[placed][:, :-1, -1], axis=0)
     return {
         "camera": _camera_on_path(T),
+        "origin": origin.tolist(),
         "num_placed": int(placed.sum()),
         "num_poses": len(T),
         "before": floats(old[:, :-1, -1] - origin),

@@ -17,6 +17,8 @@ _SCRIPTS = (
     "unpack.js",
     "base.js",
     "view.js",
+    "ellipsoids.js",
+    "control.js",
     "section.js",
     "pairs.js",
     "graph.js",

@@ -1,7 +1,7 @@
 """What the pages of scans and of graphs have in common."""
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,32 @@ def error_ellipsoid(
         "middle": (R @ middle + t).tolist(),
         "axes": (R @ vector * reach).T.tolist(),
     }
+
+
+def control_rows(
+    known: Sequence[Mapping[str, Any]] | None, names: Sequence[Any]
+) -> list[dict[str, Any]]:
+    """The control points of `known`, numbered from 1.
+
+    Args:
+        known: as result.json has it, see `Result`.
+        names: of the frames, by which `known` tells them.
+    """
+    frame = {name: i for i, name in enumerate(names)}
+    points = [entry for entry in known or () if entry["kind"] == "control"]
+    return [
+        {
+            "number": n,
+            "i": frame[entry["frame"]],
+            "point": entry["point"],
+            "surveyed": entry["surveyed"],
+            "residual": entry["residual"],
+            "length": entry["translation"],
+            "normalised": entry["normalised_residual"],
+            "weight": entry["weight"],
+        }
+        for n, entry in enumerate(points, 1)
+    ]
 
 
 def details_entry(details: Mapping[str, Any] | None) -> dict[str, Any]:

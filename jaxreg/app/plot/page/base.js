@@ -22,6 +22,7 @@ const state = {
   axis: 0,
   cut: 0.5,
   edge: null, // an edge of a graph that is drawn thick
+  marks: { trusted: true, off: true }, // control points that are shown
 };
 const NUM_MODELS = SCANS ? 1 + Math.max(0, ...DATA.scans.map((s) => s.component)) : 1;
 const listeners = [];
@@ -33,8 +34,6 @@ function change(part) {
 }
 
 function inUnit(name) { return UNIT ? `${name} [${UNIT}]` : name; }
-
-function asLength(x, digits) { return UNIT ? `${number(x, digits)} ${UNIT}` : number(x, digits); }
 
 // Residuals, errors and deviations of scans in metres are told in millimetres.
 const [FINE, FINER] = UNIT === "m" ? ["mm", 1000] : [UNIT, 1];
@@ -75,6 +74,15 @@ function number(x, digits = 4) {
   const size = Math.abs(x);
   if (size >= 1e6 || size < 1e-4) return x.toExponential(digits - 1).replace("e+", "e");
   return String(Number(x.toPrecision(Math.max(digits, Math.ceil(Math.log10(size))))));
+}
+
+// So many decimals that rows of coordinates differ in six digits, however far they lie.
+function decimals(rows) {
+  const spread = Math.max(0, ...rows[0].map((_, a) => {
+    const values = rows.map((r) => r[a]);
+    return values.reduce((x, y) => Math.max(x, y)) - values.reduce((x, y) => Math.min(x, y));
+  }));
+  return spread > 0 ? Math.min(Math.max(5 - Math.floor(Math.log10(spread)), 0), 9) : 6;
 }
 
 // In words of a finger where there is no mouse.

@@ -23,7 +23,7 @@ function readGraph() {
     const at = decode(text, Float32Array);
     const part = Array.from({ length: DATA.dim }, (_, a) => Float32Array.from(used, (i) => at[i * DATA.dim + a]));
     const box = part.map((x) => [x.reduce((a, b) => Math.min(a, b)), x.reduce((a, b) => Math.max(a, b))]);
-    return { at, parts: [part], box };
+    return { at, parts: [part], box, origin: DATA.origin };
   };
   all.sort((a, b) => a.w - b.w);
   return { kinds, weakest: all.slice(0, 14), before: view(DATA.before), after: view(DATA.after) };
@@ -35,7 +35,7 @@ function graphTraces() {
   const picked = state.edge ? [[state.edge.i, state.edge.j]] : [];
   const layers = KINDS.map(([kind, , color, width]) => [GRAPH.kinds[kind], color, width, state.shown[kind]]);
   layers.push([picked, "--ink", 5, picked.length > 0]);
-  return layers.map(([edges, color, width, visible]) => {
+  const traces = layers.map(([edges, color, width, visible]) => {
     const axes = Array.from({ length: d }, () => []);
     for (const [i, j] of edges) {
       // One line with gaps is much faster than thousands of lines.
@@ -48,6 +48,7 @@ function graphTraces() {
       hoverinfo: "skip", showlegend: false, visible,
     };
   });
+  return [...traces, ...markTraces(GRAPH[state.when])];
 }
 
 function graphLayout() { return sceneLayout(GRAPH[state.when], GRAPH.after); }
@@ -73,7 +74,7 @@ function startGraph() {
   choice("when", [["before", "Before"], ["after", "After"]], "when");
   $("color").remove();
   $("home").addEventListener("click", () => Plotly.newPlot("scene", graphTraces(), graphLayout(), CONFIG));
-  $("hint").textContent = howToMove();
+  $("hint").textContent = howToMove() + markHint(GRAPH.after);
   $("list-title").textContent = "Edges";
   for (const [kind, label, color] of KINDS) {
     const box = el("input", { type: "checkbox" });
@@ -84,6 +85,7 @@ function startGraph() {
       el("span", { class: "name" }, label),
       el("small", {}, GRAPH.kinds[kind].length.toLocaleString("en"))));
   }
+  markList();
   weakest();
   listeners.push(() => Plotly.react("scene", graphTraces(), graphLayout(), CONFIG));
   return Plotly.newPlot("scene", graphTraces(), graphLayout(), CONFIG);

@@ -120,10 +120,11 @@ function drawSlab() {
   cutting = true;
   requestAnimationFrame(() => {
     cutting = false;
-    const { at, width } = cutRange();
+    const { low, high, at, width } = cutRange();
     const { origin } = arranged("after");
+    const place = (at + origin[state.axis]).toFixed(Math.max(decimals([[low], [high]]) - 2, 0));
     $("cut-at").textContent =
-      `${AXES[state.axis]} = ${asLength(at + origin[state.axis], 3)}, ${asFine(width, 2)} thick`;
+      `${AXES[state.axis]} = ${place}${UNIT && ` ${UNIT}`}, ${asFine(width, 2)} thick`;
     Plotly.react("slab", slabTraces(), slabLayout(), CONFIG);
   });
 }

@@ -41,10 +41,12 @@ function posesTable() {
     ...names.map((a) => inUnit(`t${a}`)), ...turns,
     ...(withSigma ? [inFine("σ position"), "σ angle [°]"] : []),
     ...(withErrors ? [inFine("error t"), "error R [°]"] : [])];
+  const places = rows.filter(isPlaced).map((s) => names.map((_, a) => s.T[a][DATA.dim]));
+  const digits = places.length ? decimals(places) : 6;
   const body = rows.map((s) => {
     const name = el("span", {}, ...(s.color
       ? [el("span", { class: "dot", style: `background:${rgb(s.color)}` })] : []), s.name);
-    const t = names.map((_, a) => (isPlaced(s) ? number(s.T[a][DATA.dim], 6) : "–"));
+    const t = names.map((_, a) => (isPlaced(s) ? s.T[a][DATA.dim].toFixed(digits) : "–"));
     const r = isPlaced(s) ? turnOf(s.T).map((x) => x.toFixed(3)) : turns.map(() => "–");
     const status = s.status + (isPlaced(s) ? s.component ? `, component ${s.component}` : "" : ", not placed");
     return { title: s.name, cells: [name, ...(withStatus ? [status] : []), ...t, ...r,
@@ -99,6 +101,7 @@ function header() {
       tile(`${number(DATA.kernel_width[0], 3)}, ${number(degrees(DATA.kernel_width[1]), 3)}°`, "kernel width");
     }
   }
+  controlTile();
 }
 
 function details() {
@@ -122,6 +125,7 @@ posesTable();
 details();
 (SCANS ? startScans() : startGraph()).then(() => {
   if (SCANS && !FLAT) startSection();
+  startControl();
   startResiduals();
   startCurves();
   if (SCANS && DATA.pairs.length && DATA.scans.length > 2) startPairs();

@@ -165,37 +165,7 @@ function sceneTraces() {
   });
   if (!FLAT) traces.push(cutOutline());
   if (DATA.scans.some((s) => s.axes)) traces.push(errorOutlines());
-  return traces;
-}
-
-// How many times as large the ellipsoids of a model are drawn as they are.
-function errorScale(model) {
-  const known = DATA.scans.filter((s) => s.axes && s.component === model);
-  const largest = Math.max(0, ...known.flatMap((s) => s.axes.map((a) => Math.hypot(...a))));
-  const { box } = arranged("after");
-  const size = Math.max(...box.map(([low, high]) => high - low));
-  return largest > 0 ? Number((0.06 * size / largest).toPrecision(1)) : 0;
-}
-
-// Where the middles of the scans may lie: an ellipse in each plane of two axes.
-function errorOutlines() {
-  const { origin } = arranged(state.when);
-  const grow = state.when === "after" && !state.own ? errorScale(state.model) : 0;
-  const out = Array.from({ length: DATA.dim }, () => []);
-  DATA.scans.forEach(({ axes, middle }, i) => {
-    if (!axes || !grow || !isShown(i)) return;
-    for (let a = 0; a < DATA.dim; a++) for (let b = 0; b < a; b++) {
-      for (let k = 0; k <= 24; k++) {
-        const [c, s] = [Math.cos((k * Math.PI) / 12), Math.sin((k * Math.PI) / 12)];
-        out.forEach((x, n) =>
-          x.push(middle[n] - origin[n] + grow * (c * axes[a][n] + s * axes[b][n])));
-      }
-      out.forEach((x) => x.push(null));
-    }
-  });
-  return { type: FLAT ? "scattergl" : "scatter3d", mode: "lines",
-    x: out[0], y: out[1], ...(FLAT ? {} : { z: out[2] }), hoverinfo: "skip",
-    showlegend: false, line: { color: theme("--ink"), width: 2 }, visible: grow > 0 };
+  return [...traces, ...markTraces(arranged(state.when))];
 }
 
 // How far the points reach from the middle of their box, seen along one direction.
@@ -219,14 +189,18 @@ function cameraOn(view) {
   const [right, up, toward] = DATA.camera;
   const longest = Math.max(...view.box.map(([low, high]) => high - low), 1e-12);
   const { width, height } = $("scene").getBoundingClientRect();
-  const half = Math.max(reach(view, up, longest), (reach(view, right, longest) * height) / width);
-  const away = (1.1 * half) / Math.tan(Math.PI / 8) + 0.4 * reach(view, toward, longest);
+  const far = (direction) =>
+    Math.max(reach(view, direction, longest), markReach(view, direction, longest));
+  const half = Math.max(far(up), (far(right) * height) / width);
+  const away = (1.1 * half) / Math.tan(Math.PI / 8) + 0.4 * far(toward);
   const at = (v, s) => ({ x: v[0] * s, y: v[1] * s, z: v[2] * s });
   return { eye: at(toward, away), up: at(up, 1), center: { x: 0, y: 0, z: 0 } };
 }
 
 // The layout of the main view; `seen` is what the camera starts on.
-function sceneLayout({ box, key = state.when } = arranged(state.when), seen = null) {
+function sceneLayout(view = arranged(state.when), seen = null) {
+  const { box, key = state.when } = view;
+  const middle = box.map(([low, high]) => (low + high) / 2);
   const base = {
     margin: { l: 0, r: 0, t: 0, b: 0 },
     paper_bgcolor: "rgba(0,0,0,0)",
@@ -235,23 +209,26 @@ function sceneLayout({ box, key = state.when } = arranged(state.when), seen = nu
   };
   if (FLAT) {
     const grow = 0.05 * Math.max(...box.map(([l, h]) => h - l));
-    const axis = (a) => ({ visible: false, range: [box[a][0] - grow, box[a][1] + grow] });
+    const half = halfSides(view, box.map(([l, h]) => (h - l) / 2 + grow));
+    const axis = (a) => ({ visible: false, range: [middle[a] - half[a], middle[a] + half[a]] });
     return {
-      ...base, dragmode: "pan", uirevision: key,
+      ...base, dragmode: "pan", uirevision: key, annotations: markLabels(view),
       xaxis: axis(0), yaxis: { ...axis(1), scaleanchor: "x" },
     };
   }
   const extent = box.map(([low, high]) => Math.max(high - low, 1e-12));
   const longest = Math.max(...extent);
-  const ratio = extent.map((e) => Math.max(e / longest, 0.01));
-  const room = extent.map((e) => 0.02 * e);
+  const half = halfSides(view, extent.map((e) => 0.52 * e));
+  // In longest sides of the model, so that far marks leave the camera where it is.
+  const ratio = half.map((h) => Math.max(h / (0.52 * longest), 0.01));
   const axis = (a) => ({ visible: false, autorange: false,
-    range: [box[a][0] - room[a], box[a][1] + room[a]] });
+    range: [middle[a] - half[a], middle[a] + half[a]] });
   return {
     ...base,
     scene: {
       xaxis: axis(0), yaxis: axis(1), zaxis: axis(2),
       aspectmode: "manual", aspectratio: { x: ratio[0], y: ratio[1], z: ratio[2] },
+      annotations: markLabels(view),
       camera: cameraOn(seen || arranged("after")), dragmode: "orbit", uirevision: "keep",
       bgcolor: "rgba(0,0,0,0)",
     },
@@ -367,9 +344,10 @@ function startScans() {
   const grown = errorScale(state.model);
   const errors = grown ? ` ${FLAT ? "Ellipses" : "Ellipsoids"}: where the middle of each scan may be (95 %), `
     + `${grown.toLocaleString("en")} times as large.` : "";
-  $("hint").textContent = howToMove() + mixed + errors + thinned;
+  $("hint").textContent = howToMove() + mixed + errors + markHint(arranged("after")) + thinned;
   $("home").addEventListener("click", resetView);
   scanList();
+  markList();
   modeList();
   listeners.push(drawScene, showScale, showOnly);
   showScale();
