@@ -373,3 +373,21 @@ def test_of_many_priors_some_place_a_body():
     found = brought(start, part, poses, None, None, jnp.ones(()))
     assert bool(jnp.all(found.held))
     np.testing.assert_allclose(found.T_world_i, X, atol=1e-4)
+
+
+@pytest.mark.parametrize(("deviation", "agrees"), [(0.02, False), (2.0, True)])
+def test_three_points_that_bend_all_by_many_deviations_do_not_agree(deviation, agrees):
+    """One of three is off by 10: none of them shows which."""
+    X, edges, T_i_j, _ = random_graph(7, 14, 0.0, 1)
+    info = np.broadcast_to(1e4 * np.eye(6, dtype=np.float32), (len(edges), 6, 6))
+    graph = PoseGraph.from_edges(edges, T_i_j.astype(np.float32), information=info)
+    seen = np.eye(3)
+    control = [
+        (i, u, X[i][:3, :3] @ u + X[i][:3, 3], np.eye(3) / deviation**2)
+        for i, u in zip((1, 3, 5), seen, strict=True)
+    ]
+    sol = average(graph, MotionAveraging(), control=control)
+    assert sol.status == Status.CONVERGED
+    control[1][2][0] += 10 * deviation if agrees else 10
+    sol = average(graph, MotionAveraging(), control=control)
+    assert sol.status == (Status.CONVERGED if agrees else Status.NO_AGREEMENT)

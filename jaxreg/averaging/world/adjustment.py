@@ -40,6 +40,9 @@ from jaxreg.graph.pose_graph import PoseGraph
 _ROUNDS = 5
 # Rows from which on their middle misfit says more than their own deviations.
 _ENOUGH = 3
+# Deviations are told too small by some factor of one digit, where receivers and people
+# are sure of themselves; where the middle one is off by more, a row is a mistake.
+_MISTAKEN = 10.0
 
 
 class _Minimum(NamedTuple):
@@ -166,6 +169,18 @@ class Adjustment(eqx.Module):
         problem = _Problem.of(graph, known, at.trust, at.T_world_i, self.joined)
         end = follow_graph(problem.graph, problem.T_start, problem.moved)
         return problem.poses(end)
+
+    def is_mistaken(self, T: Float[Array, "v D D"]) -> Bool[Array, ""]:
+        """Whether all bends to rows that contradict each other or the edges.
+
+        Of three points one that is wrong shares its misfit with the others. Priors
+        without deviations may be off by any number of those of the edges.
+        """
+        if len(self.poses.frame) and self.poses.information is None:
+            return jnp.zeros((), bool)
+        pairs = zip(self._rows(T), self._sizes(T), strict=True)
+        told = [size for row, size in pairs if row.told]
+        return jnp.max(jnp.stack(told)) > _MISTAKEN
 
     def _edge_trust(self) -> Float[Array, " e"]:
         """What is left of wrong edges would widen the noise."""

@@ -125,6 +125,8 @@ def _adjusted(
             right, count = jnp.sum(trust[kind] > 0.5), jnp.sum(problem.usable[kind])
             undecided = (count > 1) & (2 * right <= count) & ~jnp.any(poses.fixed)
             status = jnp.where(undecided, Status.NO_AGREEMENT, status)
+        bent = problem.is_mistaken(T) & ~jnp.any(poses.fixed)
+        status = jnp.where(bent, Status.NO_AGREEMENT, status)
     beside = jnp.any(start.held)
     joined = jnp.where(beside, start.held, part == part[0])
     status = jnp.where(jnp.all(joined), status, Status.DISCONNECTED)
