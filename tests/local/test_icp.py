@@ -73,6 +73,22 @@ def test_unit_of_the_input_scales_curvature_and_covariance(near):
         np.testing.assert_allclose(of_mode, getattr(mm, field), rtol=1e-5)
 
 
+def test_covariance_is_that_of_the_pair_however_it_is_padded(near):
+    source, target, _, init, sol = near
+    # Rows that count for nothing, before the others and behind.
+    clouds = [np.pad(x, ((30, 470), (0, 0))) for x in (source, target)]
+    masks = [np.pad(np.ones(len(x), bool), (30, 470)) for x in (source, target)]
+    padded = jr.register(
+        *clouds, jr.ICP(), init=init, source_mask=masks[0], target_mask=masks[1]
+    )
+    size = np.sqrt(np.diagonal(sol.covariance))
+    np.testing.assert_allclose(
+        padded.covariance / np.outer(size, size),
+        sol.covariance / np.outer(size, size),
+        atol=0.1,
+    )
+
+
 def test_pairs_beyond_the_largest_distance_do_not_count(near):
     source, target, T, init, _ = near
     # A second object far from the target would pull the answer under L2.
