@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxreg._core.checks import check_count
+from jaxreg._core.checks import as_host_array, check_count, is_concrete
 from jaxreg._core.programs import kept_program
+from jaxreg._core.typing import ArrayLike
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.measures import deviations
 from jaxreg.averaging.steps.gauss_newton import normal_equations, precisions
@@ -19,12 +20,13 @@ def pose_covariances(
     graph: PoseGraph,
     solution: AveragingSolution,
     *,
+    poses: ArrayLike | None = None,
     max_unknowns: int = 6000,
     priors: Told = None,
     fixed: Told = None,
     control: Told = None,
     levels: Told = None,
-) -> Float[Array, "v k k"]:
+) -> Float[Array, "p k k"]:
     """The marginal covariance of each pose, with frame 0 known exactly.
 
     Of right tangents x in T_world_i exp(x), translation first, as g2o and GTSAM give
@@ -36,37 +38,81 @@ def pose_covariances(
     Args:
         graph: the graph that was averaged.
         solution: its solution, from any method.
-        max_unknowns: k per frame, at most; the matrix is dense, 144 MB of float32 for
-            the default (static).
+        poses: numbers of p frames, to have those alone, of graphs of any size: by
+            sparse solves in float64, on the host and without jit; None for all v.
+        max_unknowns: k per frame, at most, for all poses; the matrix is dense, 144 MB
+            of float32 for the default (static).
         priors: those that `average` was given; then frame 0 is held by nothing else.
         fixed: likewise.
         control: likewise.
         levels: likewise.
 
     Returns:
-        `(v, k, k)`; 0 for frame 0, or for fixed frames; NaN for frames that no trusted
-        edge holds.
+        `(p, k, k)`, in the order of `poses`, or of the v frames; 0 for frame 0, or for
+        fixed frames; NaN for frames that no trusted edge holds, and where the equations
+        are not solved.
 
     Raises:
-        ValueError: for more unknowns than `max_unknowns`, and for a solution of another
-            graph.
-        TypeError: for anything but a graph and a solution.
+        ValueError: for more unknowns than `max_unknowns`, for a solution of another
+            graph, and for poses that are no frames.
+        TypeError: for anything but a graph and a solution, for poses that are no
+            integers, and with `poses` while tracing.
 
     Gradients: none (cut).
     """
+    if poses is not None and not all(
+        map(is_concrete, jax.tree.leaves((graph, solution, poses)))
+    ):
+        raise TypeError("poses: solves run on the host, not inside jit, vmap or grad.")
     whole, placed, first = as_adjusted(graph, solution, priors, fixed, control, levels)
     check_count(max_unknowns, "max_unknowns")
+    frozen = np.array([row[0] for row in fixed or ()], np.int32)
+    if poses is not None:
+        return _of_chosen(graph, whole, placed, poses, first, frozen)
     k = lie.tangent_dim(graph.dim)
     if graph.num_poses * k > max_unknowns:
         raise ValueError(
             f"graph: wanted at most {max_unknowns // k} poses for covariances, "
-            f"found {graph.num_poses}."
+            f"found {graph.num_poses}; poses= asks for those of some frames."
         )
     covariances = _covariances(whole, placed)[first:]
     if not fixed:
         return covariances
-    frames = np.array([row[0] for row in fixed], np.int32)
-    return covariances.at[jax.device_put(frames)].set(0)
+    return covariances.at[jax.device_put(frozen)].set(0)
+
+
+def _of_chosen(
+    graph: PoseGraph,
+    whole: PoseGraph,
+    placed: AveragingSolution,
+    poses: object,
+    first: int,
+    frozen: np.ndarray,
+) -> Float[Array, "p k k"]:
+    """Those of frames of the graph, which are `first` further in the whole."""
+    # SciPy's sparse solvers take half a second to import.
+    from jaxreg.averaging.selected_covariance import selected_covariances
+
+    frames = _checked_frames(poses, graph.num_poses)
+    covariances = selected_covariances(whole, placed, frames + first)
+    covariances[np.isin(frames, frozen)] = 0
+    with np.errstate(over="ignore"):
+        return jax.device_put(covariances.astype(whole.T_i_j.dtype))
+
+
+def _checked_frames(poses: object, num: int) -> np.ndarray:
+    """Numbers of frames, `(p,)`."""
+    wanted, frames = "poses: wanted frames' numbers", as_host_array(poses, "poses")
+    if frames.ndim != 1 or not len(frames):
+        raise ValueError(
+            f"{wanted} in a sequence, at least one, found shape {frames.shape}."
+        )
+    if frames.dtype.kind not in "iu":
+        raise TypeError(f"{wanted}, found dtype {frames.dtype}.")
+    wrong = frames[(frames < 0) | (frames >= num)]
+    if len(wrong):
+        raise ValueError(f"{wanted} from 0 to {num - 1}, found {wrong[0]}.")
+    return frames.astype(np.int64)
 
 
 @kept_program

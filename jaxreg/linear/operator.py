@@ -97,14 +97,17 @@ class GraphLaplacian(lx.AbstractLinearOperator):
         i, j = self.edges[:, 0], self.edges[:, 1]
         return self.own.at[i].add(self.weight_at_i()).at[j].add(self.weight)
 
+    def across(self) -> Float[Array, "e k k"]:
+        """What frame i does to frame j: minus the block in row j, column i."""
+        if self.origin is None:
+            return self.weight
+        return jnp.swapaxes(carried_back(self.weight, self.levers), -1, -2)
+
     def dense(self) -> Float[Array, "n n"]:
         """`(v k, v k)`, for few frames: the matrix of one column."""
         num, k = self.own.shape[:2]
         i, j = self.edges[:, 0], self.edges[:, 1]
-        # What frame i does to frame j.
-        across = self.weight
-        if self.origin is not None:
-            across = jnp.swapaxes(carried_back(across, self.levers), -1, -2)
+        across = self.across()
         frame = jnp.arange(num)
         full = jnp.zeros((num, num, k, k), self.own.dtype)
         full = full.at[frame, frame].add(self.blocks())

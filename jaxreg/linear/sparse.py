@@ -34,13 +34,19 @@ def fill_reducing_order(edges: np.ndarray, num: int) -> np.ndarray:
         edges: `(e, 2)` frames whose blocks are not zero.
         num: number of frames.
     """
+    return order_and_fill(edges, num)[0]
+
+
+def order_and_fill(edges: np.ndarray, num: int) -> tuple[np.ndarray, int]:
+    """That order, and how many blocks both triangular factors have in it."""
     i, j = edges.T
     apart = i != j
     i, j = i[apart], j[apart]
     ones = np.full(len(i), -1.0)
     links = sp.csc_array((np.r_[ones, ones], (np.r_[i, j], np.r_[j, i])), (num, num))
     dominant = sp.csc_array(sp.diags_array(1 - links.sum(axis=0)) + links)
-    return np.argsort(_lu(dominant, "MMD_AT_PLUS_A").perm_c)
+    lu = _lu(dominant, "MMD_AT_PLUS_A")
+    return np.argsort(lu.perm_c), lu.nnz
 
 
 def from_blocks(parts: Sequence[Blocks], num: int, size: int) -> sp.csc_array:

@@ -134,6 +134,8 @@ def test_all_that_is_known_is_adjusted_at_once(d: int):
         wanted = np.linalg.inv(found.jac.T @ found.jac)
         covariances = np.asarray(pose_covariances(case.graph, sol, **case.told))
         np.testing.assert_array_equal(covariances[[0, 4]], 0)
+        some = pose_covariances(case.graph, sol, poses=[6, 0, 3], **case.told)
+        np.testing.assert_allclose(some, covariances[[6, 0, 3]], rtol=1e-6, atol=1e-12)
         for n, i in enumerate(free):
             own = wanted[k * n : k * (n + 1), k * n : k * (n + 1)]
             np.testing.assert_allclose(

@@ -74,6 +74,8 @@ def test_levels_and_two_places_hold_a_frame_and_wrong_levels_are_told(case: Case
     assert report.degrees_of_freedom == wanted
     covariance = np.asarray(pose_covariances(case.graph, sol, **told))
     assert np.all(np.linalg.eigvalsh(covariance)[:, 0] > 0)
+    some = np.asarray(pose_covariances(case.graph, sol, poses=[3], **told))[0]
+    np.testing.assert_allclose(some, covariance[3], atol=1e-3 * covariance[3].max())
     deviation = np.sqrt(covariance[0].diagonal())
     across = case.X[0, 2, :3]
     by_up = across @ covariance[0, 3:, 3:] @ across

@@ -254,6 +254,8 @@ def _graphs() -> Iterator[Call]:
         yield Call(f"average by {kind.__name__}", by, good, untrue, dear=True)
     good = {"graph": GRAPH, "solution": jr.average(GRAPH, jr.SpanningTree())}
     yield Call("pose_covariances", jr.pose_covariances, good, _anything)
+    some = {**good, "poses": [1, 0]}
+    yield Call("pose_covariances of some", jr.pose_covariances, some, _anything)
 
 
 def _reconstructions() -> Iterator[Call]:
