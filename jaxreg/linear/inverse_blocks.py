@@ -32,8 +32,9 @@ from jaxreg.linear.sparse import (
 )
 
 
-# Numbers in both factors, at most: 2 GB with their places.
-_MOST_FILL = 150_000_000
+# Cycles and numbers in both factors, at most: 2 GB with their places. To count these
+# is a factor by itself, of minutes and gigabytes where many cycles are of all lengths.
+_MOST_CYCLES, _MOST_FILL = 10_000, 150_000_000
 # Of multigrid, and what a block may lack, as a share of its diagonal.
 _TOLERANCE, _MAX_STEPS, _LACKING = 3e-3, 100, 1e-4
 # Blocks are held in all directions if their least eigenvalue, scaled, is above.
@@ -86,6 +87,8 @@ def _by_factor(matrix: GraphLaplacian) -> _Solve | None:
     num, k = matrix.own.shape[:2]
     used = np.any(np.asarray(matrix.weight) != 0, axis=(1, 2))
     edges = np.asarray(matrix.edges)[used]
+    if len(edges) - len(np.unique(edges)) >= _MOST_CYCLES:
+        return None
     order, fill = order_and_fill(edges, num)
     if fill * k**2 > _MOST_FILL:
         return None

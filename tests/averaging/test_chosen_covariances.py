@@ -120,7 +120,7 @@ def tube() -> tuple[PoseGraph, Any, np.ndarray, np.ndarray]:
     with jax.enable_x64(True):
         graph = PoseGraph.from_edges(edges, T, num, None, information)
         sol = average(graph, SpanningTree(), init=X)
-        H = normal_equations(graph, sol.T_world_i, graph.information)[0]
+        H = normal_equations(graph, sol.T_world_i, jnp.asarray(information))[0]
     rows = (6 * poses[:, None] + np.arange(6)).ravel()
     columns = sla.splu(sp.csc_matrix(np.asarray(H))).solve(np.eye(6 * num)[:, rows])
     blocks = columns.reshape(num, 6, 3, 6)[poses, :, np.arange(3)]
@@ -138,12 +138,14 @@ def test_a_factor_and_multigrid_agree_with_a_sparse_inverse(
     agree(found, wanted)
 
 
+@pytest.mark.parametrize(("max_steps", "lacking"), [(2, np.inf), (100, 1e-30)])
 def test_gradients_that_do_not_converge_are_not_believed(
-    tube, monkeypatch: pytest.MonkeyPatch
+    tube, max_steps: int, lacking: float, monkeypatch: pytest.MonkeyPatch
 ):
     graph, sol, poses, _ = tube
     monkeypatch.setattr(module, "_MOST_FILL", 0)
-    monkeypatch.setattr(module, "_MAX_STEPS", 2)
+    monkeypatch.setattr(module, "_MAX_STEPS", max_steps)
+    monkeypatch.setattr(module, "_LACKING", lacking)
     with jax.enable_x64(True):
         found = np.asarray(pose_covariances(graph, sol, poses=[0, poses[0]]))
     np.testing.assert_array_equal(found[0], 0)
