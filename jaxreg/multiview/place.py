@@ -100,16 +100,15 @@ def place(
 
     The root is the scan of lowest number in the largest connected set of scans. The
     other sets of two and more are averaged with it, each hung on it by one motion of no
-    consequence. Averaging starts from the spanning tree of the largest weights
-    (`prior_weight`), and stays there where no pairs agree with each other.
+    consequence. Averaging starts from the spanning tree of the likeliest pairs, unless
+    a method is given that finds its own start, and stays there where no pairs agree
+    with each other.
 
     A pair joins scans on its own if its log evidence exceeds `least` by the logarithm
     of `most_tries(v)`: each scan is tried against as many others, so the rate of false
     alarms of one trial is divided by them. Others join parts that a second pair, or a
     loop of three parts, confirms.
     """
-    if averaging is None:
-        averaging = Correntropy(initialiser=SpanningTree())
     best = jnp.zeros(len(motions.pairs), jnp.int32)
     alike = jnp.full(len(best), _is_symmetric(motions, least))
     if motions.num_modes == 1:
@@ -150,7 +149,7 @@ def _averaged(
     mode: Int[Array, " e"],
     agrees: Bool[Array, " e"],
     num_scans: int,
-    averaging: AbstractAverager,
+    averaging: AbstractAverager | None,
     least: Scalar,
 ) -> Placement:
     """By one mode of each pair, which others rival unless it agrees with poses."""
@@ -165,7 +164,11 @@ def _averaged(
     # Averaging fixes frame 0: swap the root's number with 0.
     swap = ids.at[root].set(0).at[0].set(root)
     graph = PoseGraph(swap[pairs], T_i_j, trusted, trusted > 0, None, num_scans)
-    solution = average(with_hung(graph, hung[swap]), averaging)
+    graph, start = with_hung(graph, hung[swap]), None
+    if averaging is None:
+        averaging = Correntropy()
+        start = _likeliest_tree(graph, log_evidence)
+    solution = average(graph, averaging, start)
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
     agreed = jnp.where(joins(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
@@ -181,6 +184,21 @@ def _averaged(
         world=jnp.asarray(-1, jnp.int32),
         misfit=jnp.zeros(num_scans, bool),
     )
+
+
+def _likeliest_tree(
+    graph: PoseGraph, log_evidence: Float[Array, " e"]
+) -> Float[Array, "v D D"]:
+    """Poses along the spanning tree of the likeliest edges, and those that hang parts.
+
+    Not of the largest weights: a wrong pair that shares much outweighs right ones that
+    share little, and may take the place between parts that a dozen of them join.
+    """
+    e = len(log_evidence)
+    rank = log_evidence - jnp.min(log_evidence) + 1
+    weight = graph.weight.at[:e].set(jnp.where(graph.weight[:e] > 0, rank, 0))
+    tree = eqx.tree_at(lambda g: g.weight, graph, weight)
+    return average(tree, SpanningTree()).T_world_i
 
 
 def _is_symmetric(motions: RelativeMotions, least: Scalar) -> Bool[Array, ""]:

@@ -79,7 +79,12 @@ def test_covariance_is_that_of_the_pair_however_it_is_padded(near):
     clouds = [np.pad(x, ((30, 470), (0, 0))) for x in (source, target)]
     masks = [np.pad(np.ones(len(x), bool), (30, 470)) for x in (source, target)]
     padded = jr.register(
-        *clouds, jr.ICP(), init=init, source_mask=masks[0], target_mask=masks[1]
+        clouds[0],
+        clouds[1],
+        jr.ICP(),
+        init=init,
+        source_mask=masks[0],
+        target_mask=masks[1],
     )
     size = np.sqrt(np.diagonal(sol.covariance))
     np.testing.assert_allclose(

@@ -120,3 +120,20 @@ def test_of_something_symmetric_one_mode_is_as_good_as_another():
     ids = [(0, 1), (1, 2), (2, 3)]
     found = place(_told(ids, [[5.0, 4.9]] * 3), 4, None, LEAST)
     np.testing.assert_array_equal(found.part, 0)
+
+
+def test_a_wrong_pair_that_shares_much_does_not_keep_likelier_ones_out():
+    """Two parts of five scans; between them small shares are right, a large one not."""
+    T = np.stack([motion(200 + k, 3) for k in range(10)])
+    within = [(i, j) for i, j in all_pairs(10).tolist() if (i < 5) == (j < 5)]
+    across = [(0, 5), (1, 7), (3, 9), (2, 6)]
+    i, j = np.array(within + across).T
+    modes = (np.linalg.inv(T[i]) @ T[j])[:, None].astype(np.float32)
+    modes[-1] = motion(300, 3)
+    share = np.r_[np.full(len(within), 0.6), [0.2] * 3, 0.95][:, None]
+    told = np.r_[np.full(len(within), 6.0), [4.0] * 3, 1.1][:, None]
+    parts = [jnp.asarray(x, jnp.float32) for x in (share, told, share)]
+    pairs = jnp.asarray(np.stack([i, j], 1), jnp.int32)
+    found = place(RelativeMotions(pairs, jnp.asarray(modes), *parts), 10, None, LEAST)
+    np.testing.assert_array_equal(found.part, 0)
+    np.testing.assert_array_equal(found.edge_weight > 0.5, np.arange(len(i)) < 23)
