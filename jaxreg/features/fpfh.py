@@ -92,7 +92,7 @@ def _histogram(
     """Of values in [-1, 1], each shared by the two nearest bins."""
     at = jnp.clip((x + 1) * (_BINS / 2) - 0.5, 0, _BINS - 1)
     bins = jnp.arange(_BINS, dtype=x.dtype)
-    share = jnp.maximum(0, 1 - jnp.abs(at[..., None] - bins))
+    share = jnp.maximum(0, 1 - jnp.abs(at[..., None] - bins[None, None]))
     return jnp.einsum("nk,nkb->nb", weight, share, precision=lax.Precision.HIGHEST)
 
 

@@ -96,8 +96,9 @@ def pose_covariance(
         told = optimiser.weights(there, width)
         A = answer(optimiser, few, T_there, there, width, told, _FEW_PROBES)
         here = match(few, T, row=found.row[some])
-        share = jnp.sum(few.source_mask) / jnp.maximum(jnp.sum(problem.source_mask), 1)
-        return A / share, _scatter(pulls.of(there)), _scatter(pulls.of(here))
+        asked, num = jnp.sum(few.source_mask), jnp.sum(problem.source_mask)
+        whole = (num / jnp.maximum(asked, 1)).astype(A.dtype)
+        return whole * A, _scatter(pulls.of(there)), _scatter(pulls.of(here))
 
     at_root = pulls.of(found)
     A = answer(optimiser, problem, T, found, width, weight)
@@ -196,7 +197,7 @@ def _some(
     if n <= most:
         return problem, jnp.arange(n)
     count = jnp.cumsum(mask)
-    step = jnp.maximum(count[-1], most)
+    step = jnp.maximum(count[-1], most).astype(problem.source.dtype)
     place = (_AROUND * jnp.arange(most) + number) * (step / (_AROUND * most))
     place = jnp.floor(place).astype(count.dtype)
     rows = jnp.minimum(place_among(count, place + 1), n - 1)
