@@ -225,7 +225,6 @@ def test_reconstruction_in_any_transformation():
         promise_round_trips(method, alone)
 
 
-@pytest.mark.slow
 def test_reconstruction_in_space_keeps_single_precision():
     method = REGISTRARS["ParticleFilter"].make(3)
     with jax.enable_x64(True), jax.check_tracer_leaks():

@@ -87,7 +87,7 @@ def _compatible(pairs: Correspondences, tolerance: Scalar) -> Bool[Array, "m m"]
     alike = alike & alike.T & (jnp.abs(facing - facing_) < _ANGLES)
     apart = jnp.minimum(long, long_) > _APART * tolerance
     same = (jnp.abs(long - long_) < tolerance) & apart & alike
-    return same & pairs.mask[:, None] & pairs.mask
+    return same & pairs.mask[:, None] & pairs.mask[None]
 
 
 def _between(
@@ -97,7 +97,7 @@ def _between(
 
     By differences of each coordinate: products of inner ones would cancel.
     """
-    delta = [x[:, None] - x for x in points.T]
+    delta = [x[:, None] - x[None] for x in points.T]
     distance = jnp.sqrt(sum(x * x for x in delta))
     over = sum(x * n[:, None] for x, n in zip(delta, normals.T, strict=True))
     over = jnp.abs(over) / jnp.where(distance > 0, distance, 1)
@@ -125,10 +125,10 @@ def _agreeing(
     sq = cosine = jnp.zeros((), t.dtype)
     for i in range(3):
         moved = full_matmul(R[:, i], pairs.source.T) + t[:, i : i + 1]
-        sq = sq + (moved - pairs.target[:, i]) ** 2
+        sq = sq + (moved - pairs.target[None, :, i]) ** 2
         turned = full_matmul(R[:, i], pairs.source_normals.T)
-        cosine = cosine + turned * pairs.target_normals[:, i]
-    return (sq < tolerance**2) & (jnp.abs(cosine) > _ALIKE) & pairs.mask
+        cosine = cosine + turned * pairs.target_normals[None, :, i]
+    return (sq < tolerance**2) & (jnp.abs(cosine) > _ALIKE) & pairs.mask[None]
 
 
 def _turned(R: Float[Array, "b 3 3"], x: Float[Array, "b 3"]) -> Float[Array, "b 3"]:

@@ -34,9 +34,9 @@ def mutual(source: Described, target: Described, num: int) -> Correspondences:
     """
     sq = _sq_distances(source, target)
     nearest = jnp.min(sq, axis=1, keepdims=True)
-    both = (sq == nearest) & (sq == jnp.min(sq, axis=0)) & jnp.isfinite(sq)
+    both = (sq == nearest) & (sq == jnp.min(sq, axis=0)[None]) & jnp.isfinite(sq)
     # Two least numbers and comparisons: XLA vectorises them, not an argmin.
-    row = jnp.min(jnp.where(both, _rows(sq), sq.shape[1]), axis=1)
+    row = jnp.min(jnp.where(both, _rows(sq)[None], sq.shape[1]), axis=1)
     is_mutual = row < sq.shape[1]
     second = jnp.min(jnp.where(sq == nearest, jnp.inf, sq), axis=1)
     ratio = nearest[:, 0] / jnp.maximum(second, jnp.finfo(sq.dtype).tiny)
@@ -70,5 +70,5 @@ def _sq_distances(source: Described, target: Described) -> Float[Array, "n m"]:
     first = jnp.concatenate([-2 * source.even, here, jnp.ones_like(here)], axis=1)
     other = jnp.concatenate([target.even, jnp.ones_like(there), there], axis=1)
     sq = inner(first, other) - jnp.abs(inner(2 * source.odd, target.odd))
-    known = source.mask[:, None] & target.mask
+    known = source.mask[:, None] & target.mask[None]
     return jnp.where(known, jnp.maximum(sq, 0), jnp.inf)
