@@ -20,11 +20,10 @@ from jaxreg.averaging import (
 )
 from jaxreg.geometry import lie
 from jaxreg.graph.hang import with_hung
-from jaxreg.graph.joined import in_loops_of_three, joined
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import components
 from jaxreg.multiview.choose_pairs import most_tries
-from jaxreg.multiview.parts import part_numbers, part_sizes
+from jaxreg.multiview.parts import confirmed_parts, part_numbers, part_sizes
 from jaxreg.multiview.relative_motions import RelativeMotions
 
 
@@ -173,7 +172,7 @@ def _averaged(
     agreed = jnp.where(joins(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
     strong = log_evidence >= least + math.log(most_tries(num_scans))
-    part = _confirmed_components(pairs, agreed, num_scans, strong)
+    part = confirmed_parts(pairs, agreed, num_scans, strong)
     return Placement(
         T_world_i=solution.T_world_i[swap],
         part=part,
@@ -248,36 +247,3 @@ def prior_weight(one: RelativeMotions, least: Scalar) -> Float[Array, " e"]:
 def joins(edge_weight: Float[Array, " e"]) -> Bool[Array, " e"]:
     """Which pairs join scans, by the trust that averaging leaves them."""
     return edge_weight > _MIN_TRUST
-
-
-def _confirmed_components(
-    pairs: Int[Array, "e 2"],
-    weight: Float[Array, " e"],
-    num_scans: int,
-    strong: Bool[Array, " e"],
-) -> Int[Array, " v"]:
-    """Components joined by strong pairs, or by pairs that agree and are confirmed.
-
-    Pairs confirm each other that join the same two parts, or three parts in a loop:
-    that wrong ones agree with the poses by chance is far less likely than any one of
-    them being wrong. What they join is one part from then on.
-    """
-    ones = jnp.ones(len(weight), jnp.int32)
-
-    def merged(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        part, _ = state
-        ends = part[pairs]
-        within = ends[:, 0] == ends[:, 1]
-        present = (weight > 0) & ~within
-        # Pairs that do not count are of no two parts.
-        ends = jnp.where(present[:, None], ends, num_scans - 1)
-        same = joined(ends)
-        twice = jax.ops.segment_sum(ones, same.row, len(ones))[same.row] >= 2
-        loop = in_loops_of_three(ends, present & same.first, num_scans)
-        loop = jax.ops.segment_max(loop.astype(jnp.int32), same.row, len(ones))
-        confirmed = within | twice | (loop[same.row] > 0)
-        new = components(pairs, jnp.where(confirmed, weight, 0), num_scans)
-        return new, jnp.any(new != part)
-
-    core = components(pairs, jnp.where(strong, weight, 0), num_scans)
-    return control.while_loop(lambda s: s[1], merged, (core, jnp.asarray(True)))[0]
