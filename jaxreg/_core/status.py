@@ -87,8 +87,9 @@ _ADVICE = {
     ),
     Status.NO_AGREEMENT: (
         "No motions agree with each other beyond what any tree of them agrees with by "
-        "itself, so the poses are a guess. Register again with more overlap, or add "
-        "edges."
+        "itself, so the poses are a guess: register again with more overlap, or add "
+        "edges. Or priors, control points and levels contradict each other: look at "
+        "those that are farthest off."
     ),
     Status.UNCERTIFIED: (
         "The poses are not proved to be the best: they are a local minimum or none, or "

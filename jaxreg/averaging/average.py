@@ -144,7 +144,8 @@ def average(
         beyond what any tree agrees with (`log_evidence` is at most 0, and so is that of
         the spanning tree of greatest weight); the poses of `Correntropy` are then those
         of its start. Or of priors and control points, or of levels, two and more
-        without fixed poses, no more than half agree.
+        without fixed poses, no more than half agree, or all had to bend and the middle
+        one is still off by ten of its deviations.
 
     Raises:
         TypeError: if `graph` is no PoseGraph, or one of a list of another dtype,

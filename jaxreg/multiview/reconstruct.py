@@ -129,9 +129,10 @@ def reconstruct(
     Fails:
         DISCONNECTED where some scans could not be placed, AMBIGUOUS where some can slip
         along the others; `scan_status` says which, and what is wrong with them.
-        NO_AGREEMENT where no pairs agree with each other: scans then lie as the pairs
-        of largest overlap have them; or of priors and control points, or of levels,
-        without fixed scans, no more than half agree; and of a scan that is fixed where
+        NO_AGREEMENT where no pairs agree with each other: scans then lie as the
+        likeliest pairs have them; or of priors and control points, or of levels,
+        without fixed scans, no more than half agree, or all had to bend (see
+        `average`); and of a scan that is fixed where
         none of its pairs has it. DEGENERATE where what is known holds no part of the
         scans, as of points on a line.
 
