@@ -31,8 +31,8 @@ _CELL, _MOST_CELLS = 8, 128
 _AROUND = 8
 _SIGNS = np.random.default_rng(0).choice([-1.0, 1.0], (_AROUND // 2, _MOST_CELLS))
 # Source points that are asked at each of them, others at every pose, and of these those
-# that tell the answer. With half of them as many truths are in the regions of all but
-# noisy lumps (92 in place of 98 %).
+# that tell the answer. With half of them fewer truths are in the regions: of noisy
+# lumps 91 in place of 96 %.
 _FEW, _FEW_PROBES = 256, 64
 
 
