@@ -227,7 +227,7 @@ def test_reconstruction_in_any_transformation():
 
 def test_reconstruction_in_space_keeps_single_precision():
     method = REGISTRARS["ParticleFilter"].make(3)
-    with jax.enable_x64(True), jax.check_tracer_leaks():
+    with jax.enable_x64(True):
         out = jax.eval_shape(
             lambda points: jr.reconstruct(points, key=KEY, method=method),
             scans(3, np.float32),
@@ -254,10 +254,9 @@ def test_covariances_in_any_transformation():
             np.testing.assert_allclose(many[lane], alone, rtol=1e-9)
         flat = measured(2, np.float32)
         low = jr.average(graph(*flat), jr.SpanningTree())
-        with jax.check_tracer_leaks():
-            out = jax.eval_shape(
-                lambda *args: jr.pose_covariances(graph(*args), low), *flat
-            )
+        out = jax.eval_shape(
+            lambda *args: jr.pose_covariances(graph(*args), low), *flat
+        )
         assert out.dtype == np.float32
 
 

@@ -144,7 +144,8 @@ class Match(eqx.Module):
 
 def inner(a: Float[Array, "d n"], b: Float[Array, "d n"]) -> Float[Array, " n"]:
     """Inner products of columns, row by row: faster than a reduction of length 3."""
-    return functools.reduce(operator.add, (a[k] * b[k] for k in range(len(a))))
+    terms = (x * y for x, y in zip(jnp.unstack(a), jnp.unstack(b), strict=True))
+    return functools.reduce(operator.add, terms)
 
 
 def rotate(R: Float[Array, "d d"], columns: Float[Array, "d n"]) -> Float[Array, "d n"]:
@@ -153,9 +154,12 @@ def rotate(R: Float[Array, "d d"], columns: Float[Array, "d n"]) -> Float[Array,
 
 
 def _rotated(R: Float[Array, "d d"], columns: Array) -> list[Float[Array, " n"]]:
-    d = R.shape[0]
-    terms = [[R[i, j] * columns[j] for j in range(d)] for i in range(d)]
-    return [functools.reduce(operator.add, row) for row in terms]
+    rows = jnp.unstack(columns)
+    terms = [
+        [x * row for x, row in zip(jnp.unstack(of), rows, strict=True)]
+        for of in jnp.unstack(R)
+    ]
+    return [functools.reduce(operator.add, each) for each in terms]
 
 
 def match(
@@ -176,7 +180,8 @@ def match(
     d = problem.source.shape[0]
     R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
     # Row by row: XLA vectorises no loop over rows that were stacked before their use.
-    moved = [x + t[k] for k, x in enumerate(_rotated(R, problem.source))]
+    turned = _rotated(R, problem.source)
+    moved = [x + shift for x, shift in zip(turned, jnp.unstack(t), strict=True)]
     if row is None:
         row = problem.index.lookup(jnp.stack(moved), num, coarse)
     if problem.soft is None or width is None:

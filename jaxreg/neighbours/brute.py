@@ -16,6 +16,8 @@ unless a loop returns it: hence the loop over groups whose only result is stored
 long chain in which each comparison uses the last one twice.
 """
 
+import functools
+import operator
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -246,7 +248,5 @@ def _ordered(sq: Array) -> Array:
 
 def _sq_distance(a: Array, b: Array) -> Array:
     """Sum over the first axis, unrolled: XLA vectorises over the rest."""
-    sq = (a[0] - b[0]) ** 2
-    for axis in range(1, a.shape[0]):
-        sq = sq + (a[axis] - b[axis]) ** 2
-    return sq
+    pairs = zip(jnp.unstack(a), jnp.unstack(b), strict=True)
+    return functools.reduce(operator.add, ((x - y) ** 2 for x, y in pairs))

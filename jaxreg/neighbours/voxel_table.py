@@ -161,8 +161,8 @@ def _grid(points: Array, mask: Array, resolution: int, margin: float):
 
 def _cell_of(columns: Array, origin: Array, cell: Array, resolution: int) -> Array:
     flat = jnp.zeros(columns.shape[1:], jnp.int32)
-    for axis in range(columns.shape[0]):
-        at = (columns[axis] - origin[axis]) / cell
+    for x, start in zip(jnp.unstack(columns), jnp.unstack(origin), strict=True):
+        at = (x - start) / cell
         at = jnp.clip(at, 0, resolution - 1).astype(jnp.int32)
         flat = flat * resolution + at
     return flat

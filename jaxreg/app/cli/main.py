@@ -8,6 +8,7 @@ SIGTERM, 129 by SIGHUP, 141 when nobody reads the output any more.
 import _thread
 import contextlib
 import difflib
+import gc
 import io
 import os
 import shlex
@@ -31,6 +32,8 @@ _INTERRUPTED, _UNREAD = 130, 141
 
 def command() -> NoReturn:
     """The process `jaxreg`: runs the command of its arguments and ends."""
+    # Tracing makes much garbage, which is young: to look at all of it took a quarter.
+    gc.set_threshold(50_000, 20, 50)
     sys.unraisablehook = _heard_again
     ended: list[int] = []
 
