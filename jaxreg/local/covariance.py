@@ -1,7 +1,5 @@
 """How far a registered pose may err: a sandwich taken around it, not at it."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +7,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.arrays import full_matmul, place_among
 from jaxreg._core.typing import Motion
 from jaxreg.linear.small import eigh
@@ -31,9 +30,9 @@ _CELL, _MOST_CELLS = 8, 128
 _AROUND = 8
 _SIGNS = np.random.default_rng(0).choice([-1.0, 1.0], (_AROUND // 2, _MOST_CELLS))
 # Source points that are asked at each of them, others at every pose, and of these those
-# that tell the answer. With half of them fewer truths are in the regions: of noisy
-# lumps 91 in place of 96 %.
-_FEW, _FEW_PROBES = 256, 64
+# that tell the answer. With 128 and 32 fewer truths are in the regions: of noisy lumps
+# 91 in place of 96 %.
+_FEW, _FEW_PROBES = 256, 128
 
 
 def pose_covariance(
@@ -83,48 +82,52 @@ def pose_covariance(
 
     Gradients: of no use, as the matches jump; `Curvature` cuts them.
     """
-    pulls = _Pulls(optimiser, width, _cells(problem))
     T, weight = T_target_source, optimiser.weights(found, width)
     H, _ = optimiser.residual.normal_equations(found, weight)
+    pulls = optimiser.residual.descents(found) * weight[None]
+    reach, cell = _reach(found, weight, width), _cells(problem)
+    at_root = _summed(pulls, cell[found.row])
 
-    def around(pose: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-        """A there, B there, and B of the same points at the root."""
-        tangent, number = pose
-        few, some = _some(problem, _FEW, number)
-        T_there = turn_and_shift(T, tangent)
-        there = match(few, T_there, width=width)
-        told = optimiser.weights(there, width)
-        A = answer(optimiser, few, T_there, there, width, told, _FEW_PROBES)
-        here = match(few, T, row=found.row[some])
+    def around(
+        away: Float[Array, "r k"], number: Array
+    ) -> tuple[Float[Array, "r k"], tuple[Array, Array, Array]]:
+        """A there, B there, and B of the same points at the root, which comes first."""
+        T_there = turn_and_shift(T, jnp.where(number > 0, away[number - 1], 0))
+        few, some = _some(problem, _FEW, number % _AROUND)
+        A, there, row = _told(optimiser, few, T_there, reach, width)
         asked, num = jnp.sum(few.source_mask), jnp.sum(problem.source_mask)
-        whole = (num / jnp.maximum(asked, 1)).astype(A.dtype)
-        return whole * A, _scatter(pulls.of(there)), _scatter(pulls.of(here))
+        A = (num / jnp.maximum(asked, 1)).astype(A.dtype) * A
+        here = jnp.where(few.source_mask, pulls[:, some], 0)
+        both = _summed(there, cell[row]), _summed(here, cell[found.row[some]])
+        away = control.cond(
+            number == 0,
+            lambda A: _led(at_root, inverse_within(A, H)),
+            lambda _: away,
+            A,
+        )
+        return away, (A, *map(_scatter, both))
 
-    at_root = pulls.of(found)
-    A = answer(optimiser, problem, T, found, width, weight)
+    start = jnp.zeros((_AROUND, len(H)), at_root.dtype)
+    _, found_there = control.scan(around, start, jnp.arange(1 + _AROUND))
+    A, there, here = (jnp.mean(x[1:], axis=0) for x in found_there)
     inverse = inverse_within(A, H)
-    signs = jnp.asarray(_SIGNS, at_root.dtype)
-    away = full_matmul(full_matmul(signs, at_root), inverse)
-    poses = jnp.concatenate([away, -away]), jnp.arange(_AROUND)
-    A, there, here = (jnp.mean(x, axis=0) for x in lax.map(around, poses))
     # Of all points as much as of those that were asked, in deviations of the pose.
     asked = jnp.sum(here * inverse)
     growth = jnp.sum(_scatter(at_root) * inverse) / jnp.where(asked > 0, asked, 1)
-    inverse = inverse_within(A, H)
     return full_matmul(inverse, full_matmul(growth * there, inverse))
 
 
-class _Pulls(NamedTuple):
-    """What points pull at a pose by, summed over cells."""
+def _led(
+    at_root: Float[Array, "c k"], inverse: Float[Array, "k k"]
+) -> Float[Array, "r k"]:
+    """Where cells lead to that pull either way, each with a sign of its own."""
+    signs = jnp.asarray(_SIGNS, at_root.dtype)
+    away = full_matmul(full_matmul(signs, at_root), inverse)
+    return jnp.concatenate([away, -away])
 
-    optimiser: LocalOptimiser
-    width: Float[Array, ""]
-    cell: Int[Array, " m"]  # of each target point
 
-    def of(self, found: Match) -> Float[Array, "c k"]:
-        weight = self.optimiser.weights(found, self.width)
-        each = self.optimiser.residual.descents(found) * weight[None]
-        return jax.ops.segment_sum(each.T, self.cell[found.row], _MOST_CELLS)
+def _summed(pulls: Float[Array, "k n"], cell: Int[Array, " n"]) -> Float[Array, "c k"]:
+    return jax.ops.segment_sum(pulls.T, cell, _MOST_CELLS)
 
 
 def _scatter(pulls: Float[Array, "c k"]) -> Float[Array, "k k"]:
@@ -153,37 +156,67 @@ def answer(
     found: Match,
     width: Float[Array, ""],
     weight: Float[Array, " n"],
-    probes: int = _PROBES,
 ) -> Float[Array, "k k"]:
     """A of `pose_covariance`, from some points displaced to both sides."""
-    total = jnp.sum(weight)
-    variance = jnp.sum(weight * found.plane_residual**2) / jnp.where(
-        total > 0, total, 1
-    )
-    # An interval of this half length; of matches without error, one above rounding.
-    reach = jnp.maximum(jnp.sqrt(3 * variance), 1e-3 * width)
-    d = found.source.shape[0]
-    few, some = _some(problem, probes)
-    here = match(few, T_target_source, row=found.row[some])
-    normal = here.source_normal
-
-    def pull(side: Array) -> Array:
-        """Along the normals, `reach` away on that side."""
-        away = few.source + side * reach * few.source_normals
-        there = eqx.tree_at(lambda p: p.source, few, away)
-        moved = match(there, T_target_source)
-        weight = optimiser.weights(moved, width) * few.source_mask
-        return weight * inner(normal, optimiser.residual.descents(moved)[:d])
-
-    sides = jnp.asarray([-1, 1], reach.dtype)
-    before, behind = jax.vmap(pull)(sides)  # one search for both
-    slope = (before - behind) / (2 * jnp.where(reach > 0, reach, 1))
-    slope = slope * jnp.sign(inner(normal, here.normal))
-    by_source, by_target = along(normal, here)[:-1], along(here.normal, here)[:-1]
-    A = full_matmul(by_source * slope[None], by_target.T)
-    # As if all points had been asked, by the share of the weight of those that were.
+    reach = _reach(found, weight, width)
+    few, some = _some(problem, _PROBES)
+    moved = match(_displaced(few, reach), T_target_source)
+    pulls = optimiser.residual.descents(moved) * optimiser.weights(moved, width)[None]
+    A = _answer(pulls, match(few, T_target_source, row=found.row[some]), reach)
     asked = jnp.sum(weight[some] * few.source_mask)
-    return total / jnp.where(asked > 0, asked, 1) * (A + A.T) / 2
+    return jnp.sum(weight) / jnp.where(asked > 0, asked, 1) * A
+
+
+def _told(
+    optimiser: LocalOptimiser,
+    few: Problem,
+    T_target_source: Motion,
+    reach: Float[Array, ""],
+    width: Float[Array, ""],
+) -> tuple[Float[Array, "k k"], Float[Array, "k n"], Int[Array, " n"]]:
+    """A of these points, their pulls, and their rows in the target: by one search."""
+    n, (probes, some) = len(few.source_mask), _some(few, _FEW_PROBES)
+    found = match(few.beside(_displaced(probes, reach)), T_target_source, width=width)
+    weight = optimiser.weights(found, width)
+    pulls = optimiser.residual.descents(found) * weight[None]
+    at_rest = match(probes, T_target_source, row=found.row[some])
+    A = _answer(pulls[:, n:], at_rest, reach)
+    # As if all points had been asked, by the share of the weight of those that were.
+    asked = jnp.sum(weight[some] * probes.source_mask)
+    A = jnp.sum(weight[:n]) / jnp.where(asked > 0, asked, 1) * A
+    return A, pulls[:, :n], found.row[:n]
+
+
+def _reach(
+    found: Match, weight: Float[Array, " n"], width: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Half the interval of slopes; of matches without error, one above rounding."""
+    total = jnp.sum(weight)
+    sq = jnp.sum(weight * found.plane_residual**2) / jnp.where(total > 0, total, 1)
+    return jnp.maximum(jnp.sqrt(3 * sq), 1e-3 * width)
+
+
+def _displaced(problem: Problem, reach: Float[Array, ""]) -> Problem:
+    """Its points as far away along their normals, on one side and on the other."""
+    away = reach * problem.source_normals
+    before, behind = (
+        eqx.tree_at(lambda p: p.source, problem, problem.source + x)
+        for x in (-away, away)
+    )
+    return before.beside(behind)
+
+
+def _answer(
+    pulls: Float[Array, "k two_n"], at_rest: Match, reach: Float[Array, ""]
+) -> Float[Array, "k k"]:
+    """A of points at rest, from the pulls on either side."""
+    normal, d = at_rest.source_normal, len(at_rest.normal)
+    before, behind = jnp.split(pulls[:d], 2, axis=1)
+    slope = inner(normal, before - behind) / (2 * jnp.where(reach > 0, reach, 1))
+    slope = slope * jnp.sign(inner(normal, at_rest.normal))
+    by_source, by_target = (along(x, at_rest)[:-1] for x in (normal, at_rest.normal))
+    A = full_matmul(by_source * slope[None], by_target.T)
+    return (A + A.T) / 2
 
 
 def _some(

@@ -163,8 +163,8 @@ class Witness(eqx.Module):
     @classmethod
     def of_some(cls, source: PointCloud, target: PointCloud) -> "Witness":
         """Of some points of clouds that have no index: all pairs are compared."""
-        source = source.spread(_SOME).with_spacing()
-        target = target.spread(_SOME).with_spacing()
+        some = source.spread(_SOME), target.spread(_SOME)
+        source, target = on_both(lambda cloud: cloud.with_spacing(), *some)
         index = BruteForce.build(source.points, source.mask)
         return cls.of(
             source, target, index, BruteForce.build(target.points, target.mask)

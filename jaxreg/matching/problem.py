@@ -79,6 +79,17 @@ class Problem(eqx.Module):
         """The problem with the source a factor larger."""
         return eqx.tree_at(lambda p: p.source, self, scale * self.source)
 
+    def beside(self, other: "Problem") -> "Problem":
+        """The problem of the source points of both, with what else this one has."""
+        return dataclasses.replace(
+            self,
+            source=jnp.concatenate([self.source, other.source], axis=1),
+            source_normals=jnp.concatenate(
+                [self.source_normals, other.source_normals], axis=1
+            ),
+            source_mask=jnp.concatenate([self.source_mask, other.source_mask]),
+        )
+
     def padded(self, num: int) -> "Problem":
         """The problem with masked rows behind the source, `num` in all."""
         pad = num - self.source_mask.shape[0]
