@@ -98,14 +98,15 @@ def pose_covariance(
         asked, num = jnp.sum(few.source_mask), jnp.sum(problem.source_mask)
         A = (num / jnp.maximum(asked, 1)).astype(A.dtype) * A
         here = jnp.where(few.source_mask, pulls[:, some], 0)
-        both = _summed(there, cell[row]), _summed(here, cell[found.row[some]])
+        there = _scatter(_summed(there, cell[row]))
+        here = _scatter(_summed(here, cell[found.row[some]]))
         away = control.cond(
             number == 0,
             lambda A: _led(at_root, inverse_within(A, H)),
             lambda _: away,
             A,
         )
-        return away, (A, *map(_scatter, both))
+        return away, (A, there, here)
 
     start = jnp.zeros((_AROUND, len(H)), at_root.dtype)
     _, found_there = control.scan(around, start, jnp.arange(1 + _AROUND))

@@ -18,6 +18,7 @@ from jaxreg.app.cli.known import (
     known_entries,
     read_known,
     show_known,
+    with_names,
     writable,
 )
 from jaxreg.app.cli.options import Average
@@ -87,7 +88,7 @@ def run(command: Average, session: Session) -> int:
         before = _beside(before, sol)
     objective = [float(chordal_objective(graph, s.T_world_i)) for s in (before, sol)]
     report = edge_report(graph, sol, **known._asdict())
-    entries = known_entries(known, sol, report, ids)
+    entries = with_names(known_entries(known, sol, report, ids), command)
     by_hand = {"dropped": pairs_of(graph, dropped, ids)} if dropped.any() else {}
     by_hand |= {"forced": pairs_of(graph, right, ids)} if right.any() else {}
     told = known, entries, by_hand

@@ -1,20 +1,22 @@
 """What is known of poses: lines of a graph's file, `--control`, `--level`, `--fix`."""
 
-import csv
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from jaxreg.app.cli.guess import read_guess
+from jaxreg.app.cli.known_files import (
+    frame_of,
+    names_of_control,
+    read_control,
+    read_levels,
+)
 from jaxreg.app.cli.options import Average, KnownOptions, Multiview
 from jaxreg.app.cli.runtime import Session
 from jaxreg.app.result import Result
 from jaxreg.averaging import AveragingSolution, EdgeReport
 from jaxreg.io.errors import InputError
-from jaxreg.io.files import text_lines
 from jaxreg.io.graphs.g2o import read_g2o_known
 from jaxreg.io.graphs.g2o_known import KnownOfGraph
 from jaxreg.io.printable import printable
@@ -45,12 +47,12 @@ def _with_options(
         name, _, pose = words.partition("=")
         if not (name and pose):
             raise InputError(f"--fix {words}: wanted NAME=POSE.")
-        frame = _frame(name, ids, f"--fix {words}")
+        frame = frame_of(name, ids, f"--fix {words}")
         fixed[frame] = read_guess(pose, ("", name), d, scaled=False, of="--fix")
     control = known.control
     if command.control is not None:
-        control = control + _read_control(command.control, ids, d)
-    levels = [] if command.level is None else _read_levels(command.level, ids, d)
+        control = control + read_control(command.control, ids, d)
+    levels = [] if command.level is None else read_levels(command.level, ids, d)
     least = 2 if levels else d
     held = known.priors or fixed
     if (control or levels) and not held and len(control) < least:
@@ -93,6 +95,18 @@ def known_of_scans(
     return entries
 
 
+def with_names(
+    entries: list[dict[str, Any]], command: KnownOptions
+) -> list[dict[str, Any]]:
+    """The entries, control points of `--control` by the names that the file has."""
+    names = [] if command.control is None else names_of_control(command.control)
+    own = [entry for entry in entries if entry["kind"] == "control"]
+    # Those that the graph's own file knows come before.
+    told = [""] * (len(own) - len(names)) + names
+    name = dict(zip(map(id, own), told, strict=True))
+    return [x | {"name": name[id(x)]} if name.get(id(x)) else x for x in entries]
+
+
 def control_entry(
     T_world_i: np.ndarray,
     point: np.ndarray,
@@ -123,79 +137,6 @@ def tilt(R: np.ndarray, up: np.ndarray) -> float:
     """The angle between what is up in a frame and the vertical, in radians."""
     x, y, z = R @ up
     return float(np.arctan2(np.hypot(x, y), z))
-
-
-def _frame(word: str, ids: np.ndarray, place: str) -> int:
-    found = np.flatnonzero(ids.astype(str) == word.strip())
-    if not len(found):
-        raise InputError(
-            f"{place}: no {word.strip()!r}; the first are "
-            f"{', '.join(map(str, ids[:5]))}."
-        )
-    return int(found[0])
-
-
-def _read_control(path: Path, ids: np.ndarray, d: int) -> list[tuple[Any, ...]]:
-    """Rows: a frame, maybe a point in it, where it lies, maybe a deviation."""
-    out, told = [], None
-    for place, frame, numbers in _table(path, ids):
-        deviation = len(numbers) in (d + 1, 2 * d + 1)
-        if len(numbers) not in (d, d + 1, 2 * d, 2 * d + 1):
-            raise InputError(
-                f"{place}: wanted a frame, {d} coordinates in the world, or {d} in the "
-                f"frame and {d} in the world, and a standard deviation if it is known; "
-                f"found {len(numbers)} numbers."
-            )
-        if told not in (None, deviation):
-            raise InputError(f"{place}: a standard deviation in some rows, not in all.")
-        told = deviation
-        if deviation and numbers[-1] <= 0:
-            raise InputError(f"{place}: wanted a deviation above zero.")
-        *places, sigma = numbers if deviation else np.append(numbers, 0)
-        seen = places[:d] if len(places) == 2 * d else np.zeros(d)
-        row = (frame, np.array(seen), np.array(places[-d:]))
-        out.append((*row, np.eye(d) / sigma**2) if deviation else row)
-    if not out:
-        raise InputError(f"{path}: holds no control points.")
-    return out
-
-
-def _read_levels(path: Path, ids: np.ndarray, d: int) -> list[tuple[Any, ...]]:
-    """Rows: a frame, what points up in it, a deviation in radians."""
-    if d != 3:
-        raise InputError("--level: of what is 3D only, this is 2D.")
-    out = []
-    for place, frame, numbers in _table(path, ids):
-        if len(numbers) != 4 or not numbers[:3].any() or numbers[3] <= 0:
-            raise InputError(
-                f"{place}: wanted a frame, three numbers of the direction that points "
-                "up in it, and a standard deviation above zero, in radians."
-            )
-        out.append((frame, numbers[:3], numbers[3]))
-    if not out:
-        raise InputError(f"{path}: holds no levels.")
-    return out
-
-
-def _table(path: Path, ids: np.ndarray) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Where each row is, its frame, and its numbers.
-
-    Words in the first row are the names of the columns.
-    """
-    for n, (line, text) in enumerate(text_lines(path)):
-        if not text.strip() or text.lstrip().startswith("#"):
-            continue
-        frame, *words = next(csv.reader([text.replace(";", ",").replace("\t", ",")]))
-        place = f"{path}, line {line}"
-        try:
-            numbers = np.array(words, np.float64)
-        except ValueError:
-            if n == 0:
-                continue
-            raise InputError(f"{place}: not numbers after the frame: {text}") from None
-        if not np.isfinite(numbers).all():
-            raise InputError(f"{place}: wanted finite numbers.")
-        yield place, _frame(frame, ids, place), numbers
 
 
 def is_told(known: KnownOfGraph) -> bool:
@@ -271,13 +212,15 @@ def show_entries(session: Session, entries: list[dict[str, Any]]) -> None:
     if not entries:
         return
     table = Table(title="Priors, control points and levels")
-    for name in ("", "frame", "off", "normalised", "trusted"):
-        table.add_column(name, justify="right")
+    named = any("name" in entry for entry in entries)
+    for head in ("", *["name"][: int(named)], "frame", "off", "normalised", "trusted"):
+        table.add_column(head, justify="right")
     order = sorted(entries, key=lambda x: x["weight"])
     for entry in order[:20]:
         normalised = entry.get("normalised_residual")
         table.add_row(
             entry["kind"],
+            *[printable(entry.get("name", ""))][: int(named)],
             printable(str(entry["frame"])),
             _off(entry),
             "" if normalised is None else f"{normalised:.2f}",

@@ -22,6 +22,7 @@ from jaxreg.app.cli.known import (
     of_middles,
     read_known_scans,
     show_entries,
+    with_names,
 )
 from jaxreg.app.cli.options import Multiview, Order
 from jaxreg.app.cli.runtime import Session, key_of, method_of
@@ -89,6 +90,8 @@ def run(command: Multiview, session: Session) -> int:
     finally:
         if view is not None:
             view.close()
+    if result.known is not None:
+        result = dataclasses.replace(result, known=with_names(result.known, command))
     errors = None if truth is None else outputs.pose_errors(result, *truth)
     code = report(session, result, scans, errors)
     log.remove()

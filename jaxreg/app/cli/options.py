@@ -61,7 +61,7 @@ class KnownOptions:
         Path | None,
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),
     ] = None
-    """Surveyed points, rows of: frame, [point in it,] point in the world [, sigma]."""
+    """Surveyed points: frame, [name,] [point in it,] point in the world [, sigma]."""
     level: Annotated[
         Path | None,
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),

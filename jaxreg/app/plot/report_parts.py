@@ -65,6 +65,7 @@ def control_rows(
     return [
         {
             "number": n,
+            "name": entry.get("name", ""),
             "i": frame[entry["frame"]],
             "point": entry["point"],
             "surveyed": entry["surveyed"],

@@ -144,8 +144,12 @@ def test_fixed_scans_and_control_points_are_those_of_the_files(
     seen = np.load("s2.npy")[:3]
     lies = seen @ poses[2, :3, :3].T + poses[2, :3, 3]
     rows = np.concatenate([seen, lies, np.full((3, 1), 0.01)], axis=1)
-    rows = [",".join(["s2", *map(repr, row)]) for row in rows.tolist()]
-    Path("targets.csv").write_text("\n".join(["scan,x,y,z,X,Y,Z,sigma", *rows]))
+    names = ["spire", "7", ""]  # a number is a name where the head says so
+    rows = [
+        ",".join(["s2", name, *map(repr, row)])
+        for name, row in zip(names, rows.tolist(), strict=True)
+    ]
+    Path("targets.csv").write_text("\n".join(["scan,target,x,y,z,X,Y,Z,sigma", *rows]))
     np.savetxt("pose.txt", poses[1])
     up = poses[0, 2, :3].tolist()
     Path("tilts.csv").write_text(f"scan,x,y,z,sigma\ns0,{up[0]},{up[1]},{up[2]},0.01")
@@ -175,6 +179,7 @@ def test_fixed_scans_and_control_points_are_those_of_the_files(
     assert found["fixed"] == ["s1"]
     np.testing.assert_allclose(found["scans"][2]["covariance"], 1e-6 * np.eye(6))
     assert [row["frame"] for row in found["known"]] == ["s2"] * 3 + ["s0"]
+    assert [row.get("name") for row in found["known"]] == ["spire", "7", None, None]
     point = found["known"][1]
     np.testing.assert_allclose(point["point"], seen[1])
     np.testing.assert_allclose(point["surveyed"], lies[1])
@@ -182,7 +187,9 @@ def test_fixed_scans_and_control_points_are_those_of_the_files(
     assert point["normalised_residual"] < 1e-3 / 0.01
     assert found["known"][3]["kind"] == "level"
     assert found["known"][3]["rotation"] < 1e-4
-    assert "Priors, control points and levels" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Priors, control points and levels" in printed
+    assert "spire" in printed
     assert main([*run, "s7=pose.txt"]) == 2
     assert "--fix s7=pose.txt: no 's7'; the first are s0" in capsys.readouterr().err
 

@@ -252,7 +252,12 @@ def test_average_goes_into_the_frame_of_what_is_known(
 ):
     (folder / "g.g2o").write_text(GRAPH)
     # The middle frame turned by a quarter at (5, 6); the last one's origin is wrong.
-    rows = ["frame,px,py,x,y,sigma", "0,1,0,5,5,0.1", "2,0,0,4,6,0.1", "2,1,0,9,9,0.1"]
+    rows = [
+        "frame,px,py,x,y,sigma",
+        "0,oak,1,0,5,5,0.1",
+        "2,0,0,4,6,0.1",
+        "2,1,0,9,9,0.1",
+    ]
     (folder / "c.csv").write_text("\n".join(rows))
     pose = "1=0 -1 5 1 0 6"
     known = ["--fix", pose, "--control", "c.csv"]
@@ -263,6 +268,7 @@ def test_average_goes_into_the_frame_of_what_is_known(
     )
     assert found["fixed"] == [1]
     assert [entry["frame"] for entry in found["known"]] == [0, 2, 2]
+    assert [entry.get("name") for entry in found["known"]] == ["oak", None, None]
     for entry in found["known"]:
         own = np.array(found["T_world_i"][entry["frame"]]) @ [*entry["point"], 1]
         off = own[:2] - entry["surveyed"]

@@ -144,13 +144,14 @@ def test_marks_lie_where_the_scans_are_in_map_coordinates(page: Page, tmp_path: 
 def test_marks_are_hidden_at_will_and_told_in_a_table(page: Page, tmp_path: Path):
     scans, result = _result()
     known = _with_points(scans, result, 10.0)
+    known[2]["name"] = "spire"
     path = tmp_path / "report.html"
     told = dataclasses.replace(result, known=known)
     write_report(path, scans, told, details={"unit": "m"})
     page.open(path)
     text = page.run("document.getElementById('control').innerText")
     row = text.splitlines()[1].split("\t")
-    assert row[:2] == ["3", "c"]
+    assert row[:2] == ["spire", "c"]
     x, y, z = known[2]["surveyed"]
     assert [float(s) for s in row[5:8]] == pytest.approx([x, y, z], abs=1e-4)
     assert row[8] == "-10000"  # told in millimetres
@@ -158,9 +159,9 @@ def test_marks_are_hidden_at_will_and_told_in_a_table(page: Page, tmp_path: Path
     assert "2 of 3" in page.run("document.getElementById('tiles').textContent")
     scene = "document.getElementById('scene').layout.scene"
     labels = f"{scene}.annotations.map(a => a.text)"
-    assert page.run(labels) == ["1, 2", "3"]
+    assert page.run(labels) == ["1, 2", "spire"]
     page.click("#none")  # surfaces hide marks
-    assert page.run(labels) == ["1, 2", "3"]
+    assert page.run(labels) == ["1, 2", "spire"]
     page.click('[data-marks="off"]')
     assert page.run(labels) == ["1, 2"]
     assert [part["visible"] for part in _marks(page)] == [True, False, True]

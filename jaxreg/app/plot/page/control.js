@@ -53,8 +53,11 @@ function halfSides(view, half) {
 function markTitle(p) {
   const off = p.residual ? `off by ${asFine(p.length, 3)}` : "not placed";
   const trust = p.weight > 0.5 ? "trusted" : "not trusted";
-  return `${p.number}: ${frameOf(p)}, ${off}, ${trust}`;
+  return `${markName(p)}: ${frameOf(p)}, ${off}, ${trust}`;
 }
+
+// As its table has it, else by its number.
+function markName(p) { return p.name || p.number; }
 
 function frameOf(p) { return SCANS ? DATA.scans[p.i].name : DATA.names[p.i]; }
 
@@ -68,7 +71,7 @@ function markPlaces() {
   return [...places.values()].map((points) => ({
     at: points[0].surveyed,
     color: theme(points.some((p) => p.weight > 0.5) ? "--good" : "--bad"),
-    numbers: points.map((p) => p.number).join(", "),
+    names: [...new Set(points.map(markName))].join(", "),
     title: points.map(markTitle).join("<br>"),
   }));
 }
@@ -100,9 +103,9 @@ function markTraces({ origin }) {
 function markLabels({ origin }) {
   const places = markPlaces();
   if (places.length > MAX_LABELS) return [];
-  return places.map(({ at, color, numbers }) => ({
+  return places.map(({ at, color, names }) => ({
     ...Object.fromEntries(at.map((c, a) => [AXES[a], c - origin[a]])),
-    text: numbers, font: { color: theme("--ink"), size: 12 }, bgcolor: theme("--card"),
+    text: names, font: { color: theme("--ink"), size: 12 }, bgcolor: theme("--card"),
     bordercolor: color, borderpad: 2, arrowcolor: color, arrowwidth: 1.5, arrowhead: 6,
     arrowsize: 0.8, ax: 0, ay: -24,
   }));
@@ -155,7 +158,7 @@ function startControl() {
   const order = [...points].sort((p, q) => (q.length ?? Infinity) - (p.length ?? Infinity));
   const rows = order.slice(0, 500).map((p) => ({
     title: markTitle(p),
-    cells: [p.number, frameOf(p), ...p.point.map((x) => x.toFixed(own)),
+    cells: [markName(p), frameOf(p), ...p.point.map((x) => x.toFixed(own)),
       ...p.surveyed.map((x) => x.toFixed(world)),
       ...(p.residual || axes.map(() => null)).map((x) => fine(x, 3)), fine(p.length, 3),
       ...(normalised ? [el("span", { class: isWide(p) ? "warn" : "" }, number(p.normalised, 3))] : []),
