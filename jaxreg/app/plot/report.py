@@ -18,6 +18,7 @@ from jaxreg.app.plot.report_parts import (
     details_entry,
     deviations,
     error_ellipsoid,
+    prior_rows,
     status_entry,
 )
 from jaxreg.app.plot.report_points import encode_points, page_points
@@ -133,6 +134,7 @@ def _page_data(
         "scans": _scan_rows(result, clouds, labels, covariances, errors),
         "pairs": _pair_rows(result),
         "control": control_rows(result.known, result.names),
+        "priors": prior_rows(result.known, result.names),
         "modes": _mode_rows(modes) if pair and modes is not None else [],
         "errors": None if errors is None else dict(errors),
         "curves": trace_curves(result.trace),

@@ -17,6 +17,7 @@ from jaxreg.app.plot.report_parts import (
     details_entry,
     deviations,
     floats,
+    prior_rows,
     raw,
     status_entry,
 )
@@ -73,6 +74,7 @@ def write_graph_report(
     how = _solver_data(solution, told)
     data = {"kind": "graph", "title": title, "dim": graph.dim, **poses, **edges, **how}
     data["control"] = control_rows(known, ids)
+    data["priors"] = prior_rows(known, ids)
     data["details"] = details_entry(details)
     write_page(path, title, data)
 

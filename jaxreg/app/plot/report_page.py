@@ -19,6 +19,7 @@ _SCRIPTS = (
     "view.js",
     "ellipsoids.js",
     "control.js",
+    "priors.js",
     "section.js",
     "pairs.js",
     "graph.js",

@@ -78,6 +78,31 @@ def control_rows(
     ]
 
 
+def prior_rows(
+    known: Sequence[Mapping[str, Any]] | None, names: Sequence[Any]
+) -> list[dict[str, Any]]:
+    """The priors and levels of `known`, numbered from 1 by their kinds.
+
+    Args:
+        known: as result.json has it, see `Result`.
+        names: of the frames, by which `known` tells them.
+    """
+    frame = {name: i for i, name in enumerate(names)}
+    return [
+        {
+            "kind": kind,
+            "number": n,
+            "i": frame[entry["frame"]],
+            "length": entry.get("translation"),
+            "angle": entry.get("rotation"),
+            "normalised": entry.get("normalised_residual"),
+            "weight": entry["weight"],
+        }
+        for kind in ("prior", "level")
+        for n, entry in enumerate((x for x in known or () if x["kind"] == kind), 1)
+    ]
+
+
 def details_entry(details: Mapping[str, Any] | None) -> dict[str, Any]:
     """How a result was made, the versions of this process by default."""
     return {"versions": versions(), **({} if details is None else details)}

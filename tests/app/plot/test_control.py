@@ -145,6 +145,11 @@ def test_marks_are_hidden_at_will_and_told_in_a_table(page: Page, tmp_path: Path
     scans, result = _result()
     known = _with_points(scans, result, 10.0)
     known[2]["name"] = "spire"
+    tilts = [("a", 1.0, 0.001), ("c", 0.0, 0.2)]
+    known += [
+        {"kind": "level", "frame": scan, "weight": weight, "rotation": angle}
+        for scan, weight, angle in tilts
+    ]
     path = tmp_path / "report.html"
     told = dataclasses.replace(result, known=known)
     write_report(path, scans, told, details={"unit": "m"})
@@ -156,7 +161,15 @@ def test_marks_are_hidden_at_will_and_told_in_a_table(page: Page, tmp_path: Path
     assert [float(s) for s in row[5:8]] == pytest.approx([x, y, z], abs=1e-4)
     assert row[8] == "-10000"  # told in millimetres
     assert row[-1] == "no"
-    assert "2 of 3" in page.run("document.getElementById('tiles').textContent")
+    tiles = page.run("document.getElementById('tiles').textContent")
+    assert "2 of 3control points trusted" in tiles
+    assert "1 of 2levels trusted" in tiles
+    levels = page.run("document.getElementById('priors').innerText").splitlines()[1:]
+    assert [line.split("\t")[:2] for line in levels] == [
+        ["level 2", "c"],
+        ["level 1", "a"],
+    ]
+    assert levels[0].split("\t")[3] == "11.5"  # degrees
     scene = "document.getElementById('scene').layout.scene"
     labels = f"{scene}.annotations.map(a => a.text)"
     assert page.run(labels) == ["1, 2", "spire"]

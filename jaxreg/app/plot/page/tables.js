@@ -102,6 +102,7 @@ function header() {
     }
   }
   controlTile();
+  priorsTile();
 }
 
 function details() {
@@ -126,6 +127,7 @@ details();
 (SCANS ? startScans() : startGraph()).then(() => {
   if (SCANS && !FLAT) startSection();
   startControl();
+  startPriors();
   startResiduals();
   startCurves();
   if (SCANS && DATA.pairs.length && DATA.scans.length > 2) startPairs();
