@@ -19,6 +19,7 @@ from jaxreg.app.cli.known import (
     read_known,
     show_known,
     with_names,
+    with_shown_noise,
     writable,
 )
 from jaxreg.app.cli.options import Average
@@ -69,10 +70,12 @@ def run(command: Average, session: Session) -> int:
         dropped = motions_between(command.drop, graph, ids, "--drop")
         right = motions_between(command.force, graph, ids, "--force")
     graph = left_out(graph, dropped)
-    if not is_told(known):
+    if is_told(known):
+        graph, note = with_shown_noise(graph)
+    else:
         graph, ids, note = rooted(graph, ids)
-        if note:
-            session.console.print(note)
+    if note:
+        session.console.print(note)
     for message in {str(w.message) for w in caught}:
         session.console.print(message)
     key = key_of(command)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from rich.table import Table
 
@@ -16,12 +17,15 @@ from jaxreg.app.cli.options import Average, KnownOptions, Multiview
 from jaxreg.app.cli.runtime import Session
 from jaxreg.app.result import Result
 from jaxreg.averaging import AveragingSolution, EdgeReport
+from jaxreg.graph import PoseGraph
 from jaxreg.io.errors import InputError
 from jaxreg.io.graphs.g2o import read_g2o_known
 from jaxreg.io.graphs.g2o_known import KnownOfGraph
 from jaxreg.io.printable import printable
 
 
+# So many loops tell a deviation within an eighth, 1 / sqrt(2 * 3 * 10).
+_LOOPS = 10
 #: Of no graph and no scan.
 NOTHING = KnownOfGraph([], [], [])
 
@@ -73,6 +77,25 @@ def of_middles(known: KnownOfGraph, middles: np.ndarray) -> KnownOfGraph:
         fixed.append((frame, moved))
     control = [(frame, p - middles[frame], *rest) for frame, p, *rest in known.control]
     return KnownOfGraph([], fixed, control, known.levels)
+
+
+def with_shown_noise(graph: PoseGraph) -> tuple[PoseGraph, str]:
+    """The graph, and a note if its edges tell no deviations: all have the identity.
+
+    A metre and a radian would let any edge bend to what is known. What they show among
+    each other is taken in place of it, if there are loops enough.
+    """
+    info = graph.information
+    if info is None or np.any(np.asarray(info) != np.eye(info.shape[-1])):
+        return graph, ""
+    said = "All edges have the identity for their information: "
+    if np.sum(graph.mask) - (graph.num_poses - 1) < _LOOPS:
+        return graph, (
+            f"{said}a deviation of 1 each way, so that they bend to whatever is known, "
+            "also where it is wrong. Better deviations in the file mend that."
+        )
+    graph = eqx.tree_at(lambda g: g.information, graph, None)
+    return graph, f"{said}in place of it their deviations are what their loops show."
 
 
 def known_of_scans(
