@@ -7,7 +7,7 @@ from helpers import motion, pose_error
 
 from jaxreg.multiview import RelativeMotions
 from jaxreg.multiview.choose_pairs import all_pairs
-from jaxreg.multiview.place import place
+from jaxreg.multiview.place import Placement, place
 
 
 T_TRUE = np.stack([motion(k, 3) for k in range(7)]).astype(np.float32)
@@ -15,9 +15,18 @@ PAIRS = all_pairs(7)
 # A search took a wrong mode for the best of these pairs; of SECOND the right one is the
 # second, of LOST it was not found.
 SECOND, LOST = (2, 6, 9, 14), (4, 17)
-
-
+# Beside what a test tells of so many scans others lie alone: all are of one program.
+NUM = 10
 LEAST = jnp.float32(1.0)
+
+
+def _placed(motions: RelativeMotions) -> Placement:
+    return place(motions.with_modes(4).padded(NUM * (NUM - 1) // 2), NUM, None, LEAST)
+
+
+def _alone(first: int) -> list[int]:
+    """Parts of scans from here on that nothing is told of."""
+    return list(range(first, NUM))
 
 
 def _motions(order: list[int]) -> RelativeMotions:
@@ -38,8 +47,8 @@ def _motions(order: list[int]) -> RelativeMotions:
 def test_a_second_mode_counts_where_it_agrees_with_the_poses():
     every = list(range(len(PAIRS)))
     for order in (every, every[::-1]):
-        found = place(_motions(order), 7, None, LEAST)
-        for T, T_true in zip(found.T_world_i, T_TRUE, strict=True):
+        found = _placed(_motions(order))
+        for T, T_true in zip(found.T_world_i[:7], T_TRUE, strict=True):
             T_expected = np.linalg.inv(T_TRUE[0]) @ T_true
             angle, shift = pose_error(T, T_expected)
             assert angle < 1e-3
@@ -47,21 +56,21 @@ def test_a_second_mode_counts_where_it_agrees_with_the_poses():
         mode, weight = (np.asarray(x)[order] for x in (found.mode, found.edge_weight))
         np.testing.assert_array_equal(mode, np.isin(every, SECOND))
         np.testing.assert_array_equal(weight < 0.1, np.isin(every, LOST))
-        np.testing.assert_array_equal(found.part, 0)
+        np.testing.assert_array_equal(found.part, [0] * 7 + _alone(7))
 
 
 def test_without_second_modes_their_pairs_are_not_believed():
     motions = _motions(list(range(len(PAIRS)))).with_modes(1)
-    found = place(motions, 7, None, LEAST)
+    weight = np.asarray(_placed(motions).edge_weight)[: len(PAIRS)]
     wrong = np.isin(range(len(PAIRS)), SECOND + LOST)
-    np.testing.assert_array_equal(np.asarray(found.edge_weight) < 0.1, wrong)
+    np.testing.assert_array_equal(weight < 0.1, wrong)
 
 
 def test_the_only_pair_of_two_scans_needs_no_other_to_confirm_it():
-    T_i_j = jnp.asarray(np.linalg.inv(T_TRUE[0]) @ T_TRUE[1])[None, None]
-    weak, told = jnp.full((1, 1), 0.15), LEAST + jnp.full((1, 1), 0.5)
-    ids = jnp.array([[0, 1]], jnp.int32)
-    pair = RelativeMotions(ids, T_i_j, weak, told, weak)
+    T_i_j = (np.linalg.inv(T_TRUE[0]) @ T_TRUE[1])[None, None]
+    weak, told = np.full((1, 1), 0.15, np.float32), np.full((1, 1), 1.5, np.float32)
+    ids = np.array([[0, 1]], np.int32)
+    pair = RelativeMotions(*map(jnp.asarray, (ids, T_i_j, weak, told, weak))).padded(3)
     for num_scans, parts in ((2, [0, 0]), (3, [0, 1, 2])):
         found = place(pair, num_scans, None, LEAST)
         np.testing.assert_array_equal(found.part, parts)
@@ -72,9 +81,10 @@ def test_loops_join_scans_none_of_whose_pairs_would_be_believed(num_loops):
     ids = np.array([[0, 1], [1, 2], [0, 2]][: 2 + num_loops], np.int32)
     i, j = ids.T
     T_i_j = (np.linalg.inv(T_TRUE[i]) @ T_TRUE[j])[:, None].astype(np.float32)
-    told = jnp.full((len(ids), 1), LEAST - 0.5)
-    share = jnp.full((len(ids), 1), 0.3)
-    motions = RelativeMotions(jnp.asarray(ids), jnp.asarray(T_i_j), share, told, share)
+    told = np.full((len(ids), 1), 0.5, np.float32)
+    share = np.full((len(ids), 1), 0.3, np.float32)
+    arrays = ids, T_i_j, share, told, share
+    motions = RelativeMotions(*map(jnp.asarray, arrays)).padded(3)
     found = place(motions, 3, None, LEAST)
     np.testing.assert_array_equal(found.part, [0, 0, 0] if num_loops else [0, 1, 2])
 
@@ -85,11 +95,9 @@ def _told(ids: list[tuple[int, int]], told: list[list[float]]) -> RelativeMotion
     right = np.linalg.inv(T_TRUE[i]) @ T_TRUE[j]
     wrong = np.stack([motion(50 + k, 3) for k in range(len(ids))])
     modes = np.stack([right, wrong], axis=1).astype(np.float32)
-    share = jnp.full((len(ids), 2), 0.4)
-    evidence = jnp.asarray(told, jnp.float32)
-    return RelativeMotions(
-        jnp.asarray(ids, jnp.int32), jnp.asarray(modes), share, evidence, share
-    )
+    share = np.full((len(ids), 2), 0.4, np.float32)
+    arrays = np.array(ids, np.int32), modes, share, np.array(told, np.float32), share
+    return RelativeMotions(*map(jnp.asarray, arrays))
 
 
 def test_log_odds_count_rivals_and_that_none_is_right():
@@ -99,7 +107,7 @@ def test_log_odds_count_rivals_and_that_none_is_right():
     np.testing.assert_allclose(odds[1], -np.log1p(np.exp(-4)), rtol=1e-4)
     np.testing.assert_allclose(odds[2, 0], 4 - np.log1p(np.exp(2.5)), rtol=1e-4)
     alone = jnp.array([True, True, False])
-    one = motions.of_modes(jnp.zeros(3, int), alone)
+    one = motions.of_modes(jnp.zeros(3, jnp.int32), alone)
     np.testing.assert_allclose(one.log_evidence[:, 0], [4, 4, odds[2, 0]], rtol=1e-5)
 
 
@@ -107,19 +115,17 @@ def test_an_answer_with_a_rival_joins_no_scans_unless_others_confirm_it():
     clear, rivalled = [5.0, -100.0], [5.0, 4.8]
     ids = [(0, 1), (1, 2), (2, 3), (3, 4)]
     told = [clear, clear, clear, rivalled]
-    assert np.asarray(place(_told(ids, told), 5, None, LEAST).part).tolist() == [
-        0, 0, 0, 0, 4,
-    ]  # fmt: skip
-    more = _told([*ids, (2, 4)], [*told, rivalled])
-    found = place(more, 5, None, LEAST)
-    np.testing.assert_array_equal(found.part, 0)
+    found = _placed(_told(ids, told))
+    np.testing.assert_array_equal(found.part, [0] * 4 + _alone(4))
+    found = _placed(_told([*ids, (2, 4)], [*told, rivalled]))
+    np.testing.assert_array_equal(found.part, [0] * 5 + _alone(5))
     np.testing.assert_array_equal(found.mode, 0)
 
 
 def test_of_something_symmetric_one_mode_is_as_good_as_another():
     ids = [(0, 1), (1, 2), (2, 3)]
-    found = place(_told(ids, [[5.0, 4.9]] * 3), 4, None, LEAST)
-    np.testing.assert_array_equal(found.part, 0)
+    found = _placed(_told(ids, [[5.0, 4.9]] * 3))
+    np.testing.assert_array_equal(found.part, [0] * 4 + _alone(4))
 
 
 def test_a_wrong_pair_that_shares_much_does_not_keep_likelier_ones_out():
@@ -132,8 +138,9 @@ def test_a_wrong_pair_that_shares_much_does_not_keep_likelier_ones_out():
     modes[-1] = motion(300, 3)
     share = np.r_[np.full(len(within), 0.6), [0.2] * 3, 0.95][:, None]
     told = np.r_[np.full(len(within), 6.0), [4.0] * 3, 1.1][:, None]
-    parts = [jnp.asarray(x, jnp.float32) for x in (share, told, share)]
-    pairs = jnp.asarray(np.stack([i, j], 1), jnp.int32)
-    found = place(RelativeMotions(pairs, jnp.asarray(modes), *parts), 10, None, LEAST)
+    floats = [x.astype(np.float32) for x in (share, told, share)]
+    arrays = np.stack([i, j], 1).astype(np.int32), modes, *floats
+    found = _placed(RelativeMotions(*map(jnp.asarray, arrays)))
     np.testing.assert_array_equal(found.part, 0)
-    np.testing.assert_array_equal(found.edge_weight > 0.5, np.arange(len(i)) < 23)
+    trusted = np.asarray(found.edge_weight)[: len(i)] > 0.5
+    np.testing.assert_array_equal(trusted, np.arange(len(i)) < 23)

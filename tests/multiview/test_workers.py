@@ -17,8 +17,8 @@ from jaxreg.datasets import sculpture_scans
 from jaxreg.multiview import workers
 
 
-# Of few programs that compile quickly: where pairs are registered is one thing, how they
-# are, and what comes of them, another.
+# Of few programs that compile quickly: where pairs are registered is one thing, how is
+# another.
 METHOD = jr.MultiStart(num_starts=32, num_steps=10, num_modes=1, batch_size=16)
 SCANS = [s.astype(np.float32) for s in sculpture_scans(5, points_per_scan=800)[0]]
 
