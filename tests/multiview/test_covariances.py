@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,22 +10,18 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import jaxreg as jr
-from jaxreg.datasets import sculpture_scans
 
 
 pytestmark = pytest.mark.usefixtures("fully_compiled")
 
 
 NUM = 8
-FILTER = jr.ParticleFilter(num_prior=1024, num_particles=64)
 
 
 @pytest.fixture(scope="module")
-def found():
+def found(reconstructed):
     """Scans, true poses, and a solution."""
-    scans, truth = sculpture_scans(NUM, seed=0, points_per_scan=3000)
-    scans = [s.astype(np.float32) for s in scans]
-    return scans, truth, jr.reconstruct(scans, key=jax.random.key(0), method=FILTER)
+    return reconstructed.scans, reconstructed.truth, reconstructed.solution
 
 
 def _error(T: np.ndarray, true: np.ndarray, middle: np.ndarray) -> np.ndarray:
