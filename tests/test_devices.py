@@ -174,7 +174,9 @@ def test_two_hosts_share_the_pairs():
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    flags = "--xla_force_host_platform_device_count=2"
+    # Two devices each, and compiled as all else is here.
+    count = "--xla_force_host_platform_device_count="
+    flags = re.sub(count + r"\d+", count + "2", os.environ["XLA_FLAGS"])
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
     hosts = [
         subprocess.Popen(
