@@ -12,7 +12,12 @@ from jaxreg._core.quantile import nearest_rank
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.world.levels import Levels
 from jaxreg.averaging.world.points import ControlPoints
-from jaxreg.averaging.world.rigid_fit import CHOICES, likeliest_place, spans
+from jaxreg.averaging.world.rigid_fit import (
+    CHOICES,
+    likeliest_place,
+    spans,
+    spans_upright,
+)
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses
 from jaxreg.linear.small import product
@@ -80,7 +85,7 @@ def brought(
         agrees = (agrees & usable & is_point).astype(T.dtype)
         holds = spans(in_world, agrees)
         if levels is not None:
-            holds = holds | (level & spans(in_world[:, :2], agrees))
+            holds = holds | (level & spans_upright(in_world, agrees))
         return T, posed[name] | holds
 
     def one(name: Array) -> tuple[Array, Array]:

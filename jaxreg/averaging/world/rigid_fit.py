@@ -22,6 +22,9 @@ from jaxreg.geometry.kabsch import kabsch
 CHOICES = 256
 #: Deviations of right points that are tried, as shares of their extent.
 _LADDER = tuple(0.3 / 2 ** (n / 2) for n in range(32))
+# Points lie on a line if they are wide by less than a thousandth of its length: they
+# would tell the turn about it a thousand times less than the others.
+_LINE = 1e-6
 #: The middle length of a vector of k normal numbers, and that which a hundredth of them
 #: exceed: roots of quantiles of chi-square.
 MEDIAN = {2: 1.177, 3: 1.538, 6: 2.313}
@@ -131,13 +134,28 @@ def _choices(num: int, size: int) -> np.ndarray:
 
 def spans(in_world: Float[Array, "c d"], trust: Float[Array, " c"]) -> Bool[Array, ""]:
     """Whether the trusted points hold every turn: they lie on no line, in 2D apart."""
-    w = jnp.where(trust > 0.5, 1.0, 0.0).astype(in_world.dtype)
-    mean = jnp.sum(w[:, None] * in_world, axis=0) / jnp.maximum(jnp.sum(w), 1)
-    off = (in_world - mean) * w[:, None]
-    spread = jnp.sum(off[:, :, None] * off[:, None, :], axis=0)
+    spread = _spread(in_world, trust)
     whole = jnp.trace(spread)
     if in_world.shape[-1] == 2:
         return whole > 0
     # The sum of the minors: the products of two of the squared widths.
     minors = (whole**2 - jnp.sum(spread**2)) / 2
-    return minors > 1e-6 * whole**2
+    return minors > _LINE * whole**2
+
+
+def spans_upright(
+    in_world: Float[Array, "c 3"], trust: Float[Array, " c"]
+) -> Bool[Array, ""]:
+    """Whether they hold the turn that levels leave: they lie on no plumb line."""
+    sq = jnp.diagonal(_spread(in_world, trust))
+    return sq[0] + sq[1] > _LINE * sq[2]
+
+
+def _spread(
+    in_world: Float[Array, "c d"], trust: Float[Array, " c"]
+) -> Float[Array, "d d"]:
+    """About the mean of the trusted points."""
+    w = jnp.where(trust > 0.5, 1.0, 0.0).astype(in_world.dtype)
+    mean = jnp.sum(w[:, None] * in_world, axis=0) / jnp.maximum(jnp.sum(w), 1)
+    off = (in_world - mean) * w[:, None]
+    return jnp.sum(off[:, :, None] * off[:, None, :], axis=0)
