@@ -1,8 +1,10 @@
 """Priors, fixed poses and control points: the answer is in their frame."""
 
+import functools
 import re
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ from jaxreg import Status
 from jaxreg.averaging import (
     Correntropy,
     MotionAveraging,
-    PoseGraphLM,
+    SpanningTree,
     average,
     edge_report,
     pose_covariances,
@@ -73,7 +75,7 @@ class Oracle:
         inverse, i, j = np.linalg.inv, *self.edges.T
         gaps = inverse(self.T_i_j) @ inverse(T[i]) @ T[j]
         known = [inverse(M) @ T[k] for k, M, _ in self.priors]
-        errors = np.asarray(LOG(jnp.asarray(np.concatenate([gaps, known]))))
+        errors = np.asarray(LOG(np.concatenate([gaps, known])))
         whole = [*self.information, *(W for *_, W in self.priors)]
         root = np.sqrt(np.append(np.ones(len(gaps)), trust[: len(known)]))
         each = zip(root, whole, errors, strict=True)
@@ -88,7 +90,7 @@ class Oracle:
 
         def moved(x: np.ndarray) -> np.ndarray:
             out = T.copy()
-            out[free] = T[free] @ np.asarray(EXP(jnp.asarray(x.reshape(-1, k))))
+            out[free] = T[free] @ np.asarray(EXP(x.reshape(-1, k)))
             return out
 
         start = np.zeros(k * len(free))
@@ -105,10 +107,10 @@ LOG, EXP, half = jax.jit(lie.log), jax.jit(lie.exp), np.linalg.cholesky
 def test_all_that_is_known_is_adjusted_at_once(d: int):
     with jax.enable_x64(True):
         case = Oracle(d)
-        sol = average(case.graph, PoseGraphLM(), **case.told)
+        sol = average(case.graph, MotionAveraging(), **case.told)
         T, trust = np.asarray(sol.T_world_i), np.asarray(sol.prior_weight)
         assert sol.status == Status.CONVERGED
-        assert bool(jnp.all(sol.placed))
+        assert np.all(sol.placed)
         np.testing.assert_allclose(T[[0, 4]], case.X[[0, 4]], atol=1e-14)
         assert np.all(trust > 0.5)
         found, free = case.minimum(T, trust)
@@ -145,10 +147,9 @@ def test_all_that_is_known_is_adjusted_at_once(d: int):
             edge_report(case.graph, sol)
 
 
-@pytest.fixture(scope="module")
-def survey() -> tuple[np.ndarray, PoseGraph]:
+def survey(num: int = 20) -> tuple[np.ndarray, PoseGraph]:
     """Poses on a map, and a graph in float32 of which a fifth is wrong."""
-    X, edges, T_i_j, _ = random_graph(20, 100, 0.2, 3)
+    X, edges, T_i_j, _ = random_graph(num, 100, 0.2, 3)
     X[:, :3, 3] *= 40
     T_i_j[:, :3, 3] *= 40
     graph = PoseGraph.from_edges(edges, T_i_j.astype(np.float32))
@@ -161,33 +162,43 @@ def off(sol: Any, X: np.ndarray) -> float:
     return float(np.linalg.norm((sol.T_world_i - X)[:, :3, 3], axis=1).max())
 
 
-def test_wrong_priors_are_told_and_a_fixed_pose_stays(
-    survey: tuple[np.ndarray, PoseGraph],
-):
-    X, graph = survey
+def rough_priors(X: np.ndarray, wrong: list[int]) -> list[tuple[int, np.ndarray]]:
+    """Eight, some of them off by ten."""
     rng = np.random.default_rng(0)
-    frames, wrong = rng.choice(20, 8, replace=False), [1, 4, 6]
-    priors = [(int(i), X[i]) for i in frames]
+    priors = [(int(i), X[i]) for i in rng.choice(len(X), 8, replace=False)]
     for n in wrong:
         shift = rng.normal(size=3)
         shift *= 10 / np.linalg.norm(shift)
         priors[n] = (priors[n][0], offset(priors[n][1], shift))
-    sol = average(graph, Correntropy(), priors=priors)
+    return priors
+
+
+def test_wrong_priors_are_told():
+    (X, graph), wrong = survey(), [1, 4, 6]
+    sol = average(graph, Correntropy(), priors=rough_priors(X, wrong))
     assert sol.status == Status.CONVERGED
     assert np.flatnonzero(np.asarray(sol.prior_weight) < 0.5).tolist() == wrong
     assert off(sol, X) < 0.5
-    held = int(frames[1])
+
+
+def test_a_fixed_pose_stays_and_decides():
+    # With the world a frame more: by the programs of twenty frames.
+    (X, graph), wrong = survey(19), [1, 3, 4, 6]
+    priors = rough_priors(X, wrong)
+    held = priors[1][0]
     sol = average(graph, Correntropy(), priors=priors, fixed=[(held, X[held])])
+    # Half of the priors contradict the rest, and the fixed pose tells which.
+    assert sol.status == Status.CONVERGED
+    assert np.flatnonzero(np.asarray(sol.prior_weight) < 0.5).tolist() == wrong
     np.testing.assert_allclose(sol.T_world_i[held], X[held], atol=1e-5)
     assert off(sol, X) < 0.5
     assert np.asarray(sol.prior_weight)[1] == 0
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_almost_half_of_the_control_points_may_be_wrong(
-    survey: tuple[np.ndarray, PoseGraph], told: bool
-):
-    X, graph = survey
+# What is told of points is adjusted to in `test_all_that_is_known_is_adjusted_at_once`.
+@pytest.mark.parametrize("told", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_almost_half_of_the_control_points_may_be_wrong(told: bool):
+    X, graph = survey()
     rng = np.random.default_rng(1)
     frames, wrong = rng.choice(20, 9, replace=False), [0, 3, 5, 8]
     seen = 3 * rng.normal(size=(9, 3))
@@ -204,22 +215,14 @@ def test_almost_half_of_the_control_points_may_be_wrong(
     assert off(sol, X) < 0.5
 
 
-def test_points_on_a_line_leave_a_turn_free():
-    X, edges, T_i_j, _ = random_graph(7, 14, 0.0, 1)
-    graph = PoseGraph.from_edges(edges, T_i_j.astype(np.float32))
-    line = [(i, np.zeros(3), np.array([i, 2.0 * i, 0])) for i in range(5)]
-    sol = average(graph, PoseGraphLM(), control=line)
-    assert sol.status == Status.DEGENERATE
-
-
 def test_parts_of_a_graph_meet_in_the_world():
-    X, edges, T_i_j, _ = random_graph(8, 20, 0.0, 2)
+    X, edges, T_i_j, _ = random_graph(8, 24, 0.0, 2, d=2)
     apart = (edges < 4).all(axis=1) | (edges >= 4).all(axis=1)
-    graph = PoseGraph.from_edges(edges[apart], T_i_j[apart].astype(np.float32))
-    sol = average(graph, PoseGraphLM(), priors=[(2, X[2]), (6, X[6])])
-    assert bool(jnp.all(sol.placed))
+    graph = PoseGraph.from_edges(edges, T_i_j.astype(np.float32), mask=apart)
+    sol = average(graph, MotionAveraging(), priors=[(2, X[2]), (6, X[6])])
+    assert np.all(sol.placed)
     np.testing.assert_allclose(sol.T_world_i, X, atol=0.05)
-    sol = average(graph, PoseGraphLM(), priors=[(6, X[6])])
+    sol = average(graph, MotionAveraging(), priors=[(6, X[6]), (5, X[5])])
     assert sol.status == Status.DISCONNECTED
     assert np.flatnonzero(np.asarray(sol.placed)).tolist() == [4, 5, 6, 7]
     assert np.asarray(sol.component).tolist() == [0, 0, 0, 0, 4, 4, 4, 4]
@@ -232,30 +235,25 @@ def test_poses_follow_what_is_known():
         u, q = (jnp.asarray(case.control[0][n]) for n in (1, 2))
 
         @jax.jit
-        def y_of_pose(move: jax.Array, shift: jax.Array) -> jax.Array:
+        @jax.value_and_grad
+        def y_of_pose(x: jax.Array) -> jax.Array:
             frame, T, W = case.priors[0]
-            T = jnp.asarray(T).at[:2, 2].add(move)
+            T = jnp.asarray(T).at[:2, 2].add(x[:2])
             sol = average(
                 case.graph,
-                PoseGraphLM(tolerance=1e-12),
+                MotionAveraging(),
                 priors=[(frame, T, W), case.priors[1]],
                 fixed=case.fixed,
-                control=[(1, u, q + shift, case.control[0][3]), *case.control[1:]],
+                control=[(1, u, q + x[2:], case.control[0][3]), *case.control[1:]],
             )
             return sol.T_world_i[1, 1, 2]
 
-        zero, step = jnp.zeros(2), 1e-4
-        by_prior, by_point = jax.jit(jax.grad(y_of_pose, (0, 1)))(zero, zero)
-        for n, axis in enumerate(step * jnp.eye(2)):
-            change = y_of_pose(axis, zero) - y_of_pose(-axis, zero)
-            assert float(by_prior[n]) == pytest.approx(
-                float(change) / (2 * step), abs=2e-3
-            )
-            change = y_of_pose(zero, axis) - y_of_pose(zero, -axis)
-            assert float(by_point[n]) == pytest.approx(
-                float(change) / (2 * step), abs=2e-3
-            )
-        assert float(by_point[1]) > 0.01
+        step = 1e-4
+        _, slope = y_of_pose(np.zeros(4))
+        for n, axis in enumerate(step * np.eye(4)):
+            change = float(y_of_pose(axis)[0] - y_of_pose(-axis)[0])
+            assert float(slope[n]) == pytest.approx(change / (2 * step), abs=2e-3)
+        assert float(slope[3]) > 0.01
 
 
 EYE, ZERO = np.eye(4), np.zeros(3)
@@ -297,63 +295,59 @@ def test_rough_priors_are_weighed_by_what_is_known_of_them():
     """Fixes of half the length of a step, one of them ten deviations off."""
     rng = np.random.default_rng(0)
     num, sigma = 20, 0.5
-    X = motions(rotations(rng, num, 3, 1.0), np.cumsum(rng.normal(size=(num, 3)), 0))
+    X = motions(rotations(rng, num, 2, 1.0), np.cumsum(rng.normal(size=(num, 2)), 0))
     edges = np.array(
         [(i, j) for i in range(num) for j in range(i + 1, i + 4) if j < num]
     )
     i, j = edges.T
     near = motions(
-        rotations(rng, len(i), 3, 0.003), 0.006 * rng.normal(size=(len(i), 3))
+        rotations(rng, len(i), 2, 0.003), 0.006 * rng.normal(size=(len(i), 2))
     )
     graph = PoseGraph.from_edges(
         edges,
         (np.linalg.inv(X[i]) @ X[j] @ near).astype(np.float32),
-        information=np.diag([6e-3**-2] * 3 + [3e-3**-2] * 3)[None].repeat(len(i), 0),
+        information=np.diag([6e-3**-2] * 2 + [3e-3**-2])[None].repeat(len(i), 0),
     )
-    rough = motions(rotations(rng, num, 3, 0.1), sigma * rng.normal(size=(num, 3)))
-    rough[3, :3, 3] += 10 * sigma
-    information = np.diag([sigma**-2] * 3 + [0.1**-2] * 3)
-    sol = average(graph, priors=[(k, X[k] @ rough[k], information) for k in range(num)])
+    rough = motions(rotations(rng, num, 2, 0.1), sigma * rng.normal(size=(num, 2)))
+    rough[3, :2, 2] += 10 * sigma
+    information = np.diag([sigma**-2] * 2 + [0.1**-2])
+    priors = [(k, X[k] @ rough[k], information) for k in range(num)]
+    sol = average(graph, MotionAveraging(), priors=priors)
     assert sol.status == Status.CONVERGED
     assert np.flatnonzero(np.asarray(sol.prior_weight) < 0.5).tolist() == [3]
     # Of twenty fixes the mean has less than a quarter of the deviation of one.
-    assert np.linalg.norm((sol.T_world_i - X)[:, :3, 3], axis=1).max() < 2 * sigma / 3
+    assert np.linalg.norm((sol.T_world_i - X)[:, :2, 2], axis=1).max() < 2 * sigma / 3
 
 
 def test_of_two_priors_that_contradict_each_other_none_is_believed():
-    X, edges, T_i_j, _ = random_graph(7, 14, 0.0, 1)
+    X, edges, T_i_j, _ = random_graph(8, 24, 0.0, 2, d=2)
     graph = PoseGraph.from_edges(edges, T_i_j.astype(np.float32))
-    away = offset(X[5], np.array([10.0, 0, 0]))
+    away = offset(X[5], np.array([10.0, 0]))
     sol = average(graph, MotionAveraging(), priors=[(2, X[2]), (5, away)])
     assert sol.status == Status.NO_AGREEMENT
     assert np.sum(np.asarray(sol.prior_weight) > 0.5) == 1
-    sol = average(
-        graph, MotionAveraging(), priors=[(2, X[2]), (5, away)], fixed=[(0, X[0])]
-    )
-    assert sol.status == Status.CONVERGED
-    np.testing.assert_array_equal(np.asarray(sol.prior_weight) > 0.5, [True, False])
 
 
 def test_drift_is_spread_up_to_what_is_known_at_the_far_end():
     """A chain that turns by half a deviation at each step, always to one side."""
     num, turn = 40, 0.002
-    X = np.tile(np.eye(4), (num, 1, 1))
-    X[:, 0, 3] = np.arange(num)
-    bias = np.eye(4)
+    X = np.tile(np.eye(3), (num, 1, 1))
+    X[:, 0, 2] = np.arange(num)
+    bias = np.eye(3)
     bias[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     edges = np.stack([np.arange(num - 1), np.arange(1, num)], 1)
     steps = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ bias
-    info = np.diag([0.02**-2] * 3 + [(2 * turn) ** -2] * 3)[None].repeat(num - 1, 0)
+    info = np.diag([0.02**-2] * 2 + [(2 * turn) ** -2])[None].repeat(num - 1, 0)
     graph = PoseGraph.from_edges(edges, steps.astype(np.float32), information=info)
-    alone = average(graph, MotionAveraging())
-    assert np.abs(alone.T_world_i[-1, :3, 3] - X[-1, :3, 3]).max() > 1.4
-    sure = np.diag([0.01**-2] * 3 + [0.001**-2] * 3)
+    alone = functools.reduce(np.matmul, steps)
+    assert np.abs(alone[:2, 2] - X[-1, :2, 2]).max() > 1.4
+    sure = np.diag([0.01**-2] * 2 + [0.001**-2])
     priors = [(k, X[k], sure) for k in (0, 1, 2, 3, num - 1)]
     # The last is off by more than a hundred deviations from where the others have it.
-    sol = average(graph, MotionAveraging(), priors=priors)
+    sol = average(graph, SpanningTree(), priors=priors)
     assert sol.status == Status.CONVERGED
     assert np.all(np.asarray(sol.prior_weight) > 0.5)
-    assert np.linalg.norm((sol.T_world_i - X)[:, :3, 3], axis=1).max() < 0.2
+    assert np.linalg.norm((sol.T_world_i - X)[:, :2, 2], axis=1).max() < 0.2
 
 
 def test_of_many_priors_some_place_a_body():
@@ -367,19 +361,19 @@ def test_of_many_priors_some_place_a_body():
         frame=jnp.asarray(frame, jnp.int32),
         T_world_prior=jnp.asarray(known, jnp.float32),
         information=None,
-        fixed=jnp.zeros(20, bool),
-        T_world_fixed=jnp.tile(jnp.eye(4), (20, 1, 1)),
+        fixed=jnp.asarray(np.zeros(20, bool)),
+        T_world_fixed=jnp.asarray(np.tile(np.eye(4, dtype=np.float32), (20, 1, 1))),
     )
-    part = jnp.zeros(20, jnp.int32)
+    part = jnp.asarray(np.zeros(20, np.int32))
     start = jnp.asarray(away @ X, jnp.float32)
-    found = brought(start, part, poses, None, None, jnp.ones(()))
-    assert bool(jnp.all(found.held))
+    unit = jnp.asarray(np.float32(1))
+    found = eqx.filter_jit(brought)(start, part, poses, None, None, unit)
+    assert np.all(found.held)
     np.testing.assert_allclose(found.T_world_i, X, atol=1e-4)
 
 
-@pytest.mark.parametrize(("deviation", "agrees"), [(0.02, False), (2.0, True)])
-def test_three_points_that_bend_all_by_many_deviations_do_not_agree(deviation, agrees):
-    """One of three is off by 10: none of them shows which."""
+def few_points(deviation: float) -> tuple[np.ndarray, PoseGraph, Any]:
+    """Seven poses, and three points that some of them see."""
     X, edges, T_i_j, _ = random_graph(7, 14, 0.0, 1)
     info = np.broadcast_to(1e4 * np.eye(6, dtype=np.float32), (len(edges), 6, 6))
     graph = PoseGraph.from_edges(edges, T_i_j.astype(np.float32), information=info)
@@ -388,8 +382,22 @@ def test_three_points_that_bend_all_by_many_deviations_do_not_agree(deviation, a
         (i, u, X[i][:3, :3] @ u + X[i][:3, 3], np.eye(3) / deviation**2)
         for i, u in zip((1, 3, 5), seen, strict=True)
     ]
-    sol = average(graph, MotionAveraging(), control=control)
+    return X, graph, control
+
+
+@pytest.mark.parametrize(("deviation", "agrees"), [(0.02, False), (2.0, True)])
+def test_three_points_that_bend_all_by_many_deviations_do_not_agree(deviation, agrees):
+    """One of three is off by 10: none of them shows which."""
+    _, graph, control = few_points(deviation)
+    sol = average(graph, SpanningTree(), control=control)
     assert sol.status == Status.CONVERGED
     control[1][2][0] += 10 * deviation if agrees else 10
-    sol = average(graph, MotionAveraging(), control=control)
+    sol = average(graph, SpanningTree(), control=control)
     assert sol.status == (Status.CONVERGED if agrees else Status.NO_AGREEMENT)
+
+
+def test_points_on_a_line_leave_a_turn_free():
+    _, graph, control = few_points(0.02)
+    line = [(i, 0 * u, np.array([i, 2.0 * i, 0]), W) for i, u, _, W in control]
+    sol = average(graph, SpanningTree(), control=line)
+    assert sol.status == Status.DEGENERATE
