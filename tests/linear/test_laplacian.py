@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,8 @@ from jaxreg.linear.operator import GraphLaplacian
 
 
 solve = jax.jit(solve_flow, static_argnums=3)
+anchored = eqx.filter_jit(GraphLaplacian.anchored)
+product = eqx.filter_jit(GraphLaplacian.mv)
 
 
 def system(num: int, seed: int, spread: float):
@@ -113,8 +116,8 @@ def dense(edges: np.ndarray, weight: np.ndarray, num: int) -> np.ndarray:
 
 def _formed(matrix: GraphLaplacian) -> np.ndarray:
     """Applied to all unit vectors."""
-    num = matrix.own.shape[0]
-    return np.asarray(matrix.mv(jnp.eye(num, dtype=matrix.own.dtype)[:, None]))[:, 0]
+    unit = np.eye(matrix.own.shape[0], dtype=matrix.own.dtype)
+    return np.asarray(product(matrix, unit[:, None]))[:, 0]
 
 
 def test_a_coarser_level_is_about_as_stiff_as_frames_that_move_as_one():
@@ -124,12 +127,9 @@ def test_a_coarser_level_is_about_as_stiff_as_frames_that_move_as_one():
     edges = np.stack([i, (i + rng.integers(1, num, 4000)) % num], axis=1)
     weight = 10 ** rng.uniform(-3, 0, 4000)
     with jax.enable_x64(True):
-        matrix = GraphLaplacian.anchored(
-            jnp.asarray(edges), jnp.asarray(weight)[:, None, None], num
-        )
-        np.testing.assert_allclose(
-            _formed(matrix), dense(edges, weight, num) + np.diag(matrix.own[:, 0, 0])
-        )
+        matrix = anchored(edges, weight[:, None, None], num)
+        own = np.diag(np.asarray(matrix.own)[:, 0, 0])
+        np.testing.assert_allclose(_formed(matrix), dense(edges, weight, num) + own)
         level, coarser = jax.jit(_coarser)(matrix)
         P = np.eye(coarser.own.shape[0])[np.asarray(level.parent)]
         expected = P.T @ _formed(matrix) @ P
@@ -145,9 +145,7 @@ def test_a_coarser_level_is_about_as_stiff_as_frames_that_move_as_one():
 
 def test_cycles_leave_little_to_the_search():
     edges, weight, flow = system(3000, 0, 2.0)
-    matrix = GraphLaplacian.anchored(
-        jnp.asarray(edges), jnp.float32(weight)[:, None, None], 3000
-    )
+    matrix = anchored(edges, np.float32(weight)[:, None, None], 3000)
     rhs = np.zeros((3000, 1, 1), np.float32)
     np.add.at(rhs[:, 0, 0], edges[:, 1], flow[:, 0])
     np.add.at(rhs[:, 0, 0], edges[:, 0], -flow[:, 0])
@@ -160,7 +158,7 @@ def test_cycles_leave_little_to_the_search():
         )
 
     x, num = rounds(matrix, jnp.asarray(rhs))
-    left = matrix.mv(x) - rhs
+    left = np.asarray(product(matrix, x)) - rhs
     assert np.linalg.norm(left) < 1e-2 * np.linalg.norm(rhs)
     assert int(num) <= 30
 
@@ -197,6 +195,11 @@ def test_far_from_the_origin_single_precision_still_holds():
     np.testing.assert_allclose(single[1], best[1], rtol=3e-3)
 
 
+_dense = eqx.filter_jit(lambda matrix: matrix.dense())
+_prolonged = eqx.filter_jit(lambda level, x: level.prolonged(x))
+_restricted = eqx.filter_jit(lambda level, x, num: level.restricted(x, num))
+
+
 def test_a_coarser_level_of_frames_at_points_is_as_stiff_as_bodies():
     num, k = 120, 3
     rng = np.random.default_rng(0)
@@ -204,18 +207,14 @@ def test_a_coarser_level_of_frames_at_points_is_as_stiff_as_bodies():
     edges = np.where(rng.random((num - 1, 1)) < 0.5, edges, edges[:, ::-1])
     root = rng.normal(size=(num - 1, k, k))
     with jax.enable_x64(True):
-        matrix = GraphLaplacian.anchored(
-            jnp.asarray(edges, jnp.int32),
-            jnp.asarray(root @ root.swapaxes(1, 2)),
-            num,
-            0.1,
-            jnp.asarray(np.cumsum(rng.normal(size=(num, 2)), axis=0)),
-        )
+        place = np.cumsum(rng.normal(size=(num, 2)), axis=0)
+        weight = root @ root.swapaxes(1, 2)
+        matrix = anchored(edges.astype(np.int32), weight, num, 0.1, place)
         level, coarser = jax.jit(_coarser)(matrix)
         count = coarser.own.shape[0]
-        unit = jnp.eye(count * k).reshape(count, k, count * k)
-        P = np.asarray(level.prolonged(unit)).reshape(num * k, count * k)
-        expected = P.T @ np.asarray(matrix.dense()) @ P
-        np.testing.assert_allclose(coarser.dense(), expected, atol=1e-9)
-        back = level.restricted(jnp.eye(num * k).reshape(num, k, num * k), count)
+        unit = np.eye(count * k).reshape(count, k, count * k)
+        P = np.asarray(_prolonged(level, unit)).reshape(num * k, count * k)
+        expected = P.T @ np.asarray(_dense(matrix)) @ P
+        np.testing.assert_allclose(_dense(coarser), expected, atol=1e-9)
+        back = _restricted(level, np.eye(num * k).reshape(num, k, num * k), count)
     np.testing.assert_allclose(np.asarray(back).reshape(count * k, -1), P.T, atol=1e-12)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -13,6 +14,15 @@ from jaxreg.linear.solvers import LeastSquares, MultigridCG, RidgedCholesky
 
 
 NUM, K, COLUMNS = 150, 3, 2
+anchored = eqx.filter_jit(GraphLaplacian.anchored)
+product = eqx.filter_jit(GraphLaplacian.mv)
+
+
+@eqx.filter_jit
+def matrices(operator: GraphLaplacian) -> tuple[jax.Array, ...]:
+    """The dense one, that of all columns, its diagonal, and the blocks on it."""
+    dense, columns = operator.dense(), operator.as_matrix()
+    return dense, columns, lx.diagonal(operator), operator.blocks()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,20 +40,17 @@ def system() -> tuple[GraphLaplacian, np.ndarray]:
     edges = np.concatenate([chain, loops[loops[:, 0] != loops[:, 1]]])
     root = rng.normal(size=(len(edges), K, K + 2))
     weight = root @ root.swapaxes(1, 2)
-    operator = GraphLaplacian.anchored(
-        jnp.asarray(edges, jnp.int32), jnp.asarray(weight), NUM, columns=COLUMNS
-    )
+    operator = anchored(edges.astype(np.int32), weight, NUM, columns=COLUMNS)
     rhs = rng.normal(size=(NUM, K, COLUMNS))
     return operator, rhs - rhs.mean(axis=0)
 
 
 def test_products_are_those_of_the_matrix(system):
     operator, x = system
-    found = operator.mv(jnp.asarray(x)).reshape(-1)
-    np.testing.assert_allclose(found, operator.as_matrix() @ x.ravel(), atol=1e-9)
-    diagonal = lx.diagonal(operator)
-    np.testing.assert_allclose(diagonal, jnp.diagonal(operator.as_matrix()))
-    dense = np.asarray(operator.dense())
+    dense, columns, diagonal, _ = map(np.asarray, matrices(operator))
+    found = np.asarray(product(operator, x)).reshape(-1)
+    np.testing.assert_allclose(found, columns @ x.ravel(), atol=1e-9)
+    np.testing.assert_allclose(diagonal, np.diagonal(columns))
     np.testing.assert_allclose(dense, dense.T, atol=1e-12)
     # Motions that all frames share cost what ties frame 0, and nothing else.
     shared = np.tile(np.eye(K), (NUM, 1))
@@ -56,24 +63,24 @@ def test_products_are_those_of_the_matrix(system):
 )
 def test_solves_under_the_driver_of_lineax(system, solver, tol):
     operator, rhs = system
-    expected = np.linalg.solve(np.asarray(operator.dense()), rhs.reshape(NUM * K, -1))
+    dense = np.asarray(matrices(operator)[0])
+    expected = np.linalg.solve(dense, rhs.reshape(NUM * K, -1))
 
     @jax.jit
     def solved(operator, rhs):
         return lx.linear_solve(operator, rhs, solver).value
 
-    x = solved(operator, jnp.asarray(rhs))
+    x = np.asarray(solved(operator, rhs))
     np.testing.assert_allclose(x.reshape(NUM * K, -1), expected, atol=tol)
     # lineax's derivative: d(x . y) / d rhs is the solution for y.
-    slope = jax.grad(lambda r: jnp.sum(solved(operator, r) * rhs))(jnp.asarray(rhs))
+    slope = jax.jit(jax.grad(lambda r: jnp.sum(solved(operator, r) * rhs)))(rhs)
     np.testing.assert_allclose(slope, x, atol=10 * tol)
 
 
 def test_steps_that_run_out_are_told(system):
     operator, rhs = system
-    found = lx.linear_solve(
-        operator, jnp.asarray(rhs), MultigridCG(1e-12, max_steps=2), throw=False
-    )
+    solver = MultigridCG(1e-12, max_steps=2)
+    found = eqx.filter_jit(lx.linear_solve)(operator, rhs, solver, throw=False)
     assert found.result == lx.RESULTS.max_steps_reached
     assert int(found.stats["num_steps"]) == 2
 
@@ -92,24 +99,19 @@ def test_velocities_may_be_taken_at_other_points(d):
     away = np.linalg.inv(carry)[edges[:, 1]]
     W = root @ root.swapaxes(1, 2)
     at_j = away.swapaxes(1, 2) @ W @ away
-    pairs = jnp.asarray(edges)
-    world = GraphLaplacian.anchored(pairs, jnp.asarray(W), num, 0.1).dense()
-    local = GraphLaplacian.anchored(
-        pairs, jnp.asarray(at_j), num, 0.1, jnp.asarray(origin)
-    )
+    world = np.asarray(matrices(anchored(edges, W, num, 0.1))[0])
+    local = anchored(edges, at_j, num, 0.1, origin)
+    dense, _, _, blocks = map(np.asarray, matrices(local))
     C = np.zeros((num, k, num, k))
     C[np.arange(num), :, np.arange(num)] = carry
     C = C.reshape(num * k, num * k)
-    np.testing.assert_allclose(C.T @ local.dense() @ C, world, atol=1e-9)
+    np.testing.assert_allclose(C.T @ dense @ C, world, atol=1e-9)
     x = rng.normal(size=(num, k, 2))
-    found = local.mv(jnp.asarray(x))
-    expected = np.asarray(local.dense()) @ x.reshape(num * k, 2)
+    found = np.asarray(product(local, x))
+    expected = dense @ x.reshape(num * k, 2)
     np.testing.assert_allclose(found.reshape(num * k, 2), expected, atol=1e-9)
-    np.testing.assert_allclose(
-        np.asarray(local.blocks()),
-        np.asarray(local.dense()).reshape(num, k, num, k)[range(num), :, range(num)],
-        atol=1e-9,
-    )
+    own = dense.reshape(num, k, num, k)[range(num), :, range(num)]
+    np.testing.assert_allclose(blocks, own, atol=1e-9)
 
 
 def _carrying(point: np.ndarray) -> np.ndarray:
