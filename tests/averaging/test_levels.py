@@ -12,6 +12,7 @@ import pytest
 from jaxreg import Status
 from jaxreg.averaging import (
     MotionAveraging,
+    SpanningTree,
     average,
     edge_report,
     pose_covariances,
@@ -56,7 +57,7 @@ def case() -> Case:
 
 def test_levels_and_two_places_hold_a_frame_and_wrong_levels_are_told(case: Case):
     told = {"control": case.points(2, 9), "levels": case.levels}
-    sol = average(case.graph, MotionAveraging(), **told)
+    sol = average(case.graph, SpanningTree(), **told)
     assert sol.status == Status.CONVERGED
     weight = np.asarray(sol.prior_weight)
     assert np.flatnonzero(weight < 0.5).tolist() == [2 + n for n in WRONG]
@@ -88,7 +89,7 @@ def test_levels_leave_a_turn_about_the_vertical_free(case: Case):
     # In line but for a ten thousandth, which says nothing of the turn.
     above = (2, np.array(case.X[2, 2, :3]), one[2] + [1e-4, 0, 1], 1e4 * np.eye(3))
     told = {"control": [one, above], "levels": case.levels}
-    sol = average(case.graph, MotionAveraging(), **told)
+    sol = average(case.graph, SpanningTree(), **told)
     assert sol.status == Status.DEGENERATE
 
 
@@ -97,7 +98,7 @@ def test_levels_of_which_half_contradict_the_rest_are_not_believed(case: Case):
     flat[NUM // 2 :] = case.X[NUM // 2 :, 0, :3]  # what lies along x
     levels = [(i, flat[i], SIGMA) for i in range(NUM)]
     told = {"control": case.points(2, 9), "levels": levels}
-    sol = average(case.graph, MotionAveraging(), **told)
+    sol = average(case.graph, SpanningTree(), **told)
     assert sol.status == Status.NO_AGREEMENT
 
 
