@@ -41,13 +41,15 @@ def test_clouds_are_taken_wherever_points_are(library: str, tmp_path: Path):
     T = motion(1, 3, angle=0.1, shift=0.02)
     source = move(np.linalg.inv(T), target)
     clouds = make(source), make(target)
-    sol = jaxreg.register(*clouds, jaxreg.ICP())
+    method = jaxreg.ICP(jaxreg.PointToPoint(), jaxreg.robust.L2(), jaxreg.ClosedForm())
+    sol = jaxreg.register(*clouds, method, init=np.eye(4))
     np.testing.assert_allclose(sol.T_target_source, T, atol=1e-4)
-    (one,) = jaxreg.register([clouds[0]], [clouds[1]], jaxreg.ICP())
+    pair = [clouds[0]], [clouds[1]]
+    (one,) = jaxreg.register(*pair, method, init=[np.eye(4)])
     np.testing.assert_allclose(one.T_target_source, T, atol=1e-4)
     # Far away, too: in float64, as theirs are.
     far = source.astype(np.float64) + 1e4
-    (one,) = jaxreg.register([make(far)], [clouds[1]], jaxreg.ICP(), init=[_back(1e4)])
+    (one,) = jaxreg.register([make(far)], [clouds[1]], method, init=[_back(1e4)])
     np.testing.assert_allclose(
         move(np.asarray(one.T_target_source), far), target, atol=1e-3
     )
