@@ -1,3 +1,5 @@
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,8 +15,8 @@ from jaxreg.linear.operator import GraphLaplacian
 
 
 solve = jax.jit(solve_flow, static_argnums=3)
-anchored = eqx.filter_jit(GraphLaplacian.anchored)
-product = eqx.filter_jit(GraphLaplacian.mv)
+anchored: Any = eqx.filter_jit(GraphLaplacian.anchored)
+product: Any = eqx.filter_jit(GraphLaplacian.mv)
 
 
 def system(num: int, seed: int, spread: float):
@@ -145,7 +147,7 @@ def test_a_coarser_level_is_about_as_stiff_as_frames_that_move_as_one():
 
 def test_cycles_leave_little_to_the_search():
     edges, weight, flow = system(3000, 0, 2.0)
-    matrix = anchored(edges, np.float32(weight)[:, None, None], 3000)
+    matrix = anchored(edges, weight.astype(np.float32)[:, None, None], 3000)
     rhs = np.zeros((3000, 1, 1), np.float32)
     np.add.at(rhs[:, 0, 0], edges[:, 1], flow[:, 0])
     np.add.at(rhs[:, 0, 0], edges[:, 0], -flow[:, 0])

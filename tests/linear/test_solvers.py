@@ -1,6 +1,7 @@
 """Solvers of graph Laplacians under lineax's own driver."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,8 +15,8 @@ from jaxreg.linear.solvers import LeastSquares, MultigridCG, RidgedCholesky
 
 
 NUM, K, COLUMNS = 150, 3, 2
-anchored = eqx.filter_jit(GraphLaplacian.anchored)
-product = eqx.filter_jit(GraphLaplacian.mv)
+anchored: Any = eqx.filter_jit(GraphLaplacian.anchored)
+product: Any = eqx.filter_jit(GraphLaplacian.mv)
 
 
 @eqx.filter_jit
