@@ -65,7 +65,7 @@ def test_where_edges_share_widths_that_follow_the_poses(d):
         graph, T = _graph(d)
         push = eqx.Partial(gradients._net_force, gaussian_trust)
         follow = eqx.Partial(mean_residual, 1.0, np.array(1.0))
-        parts = push, follow, np.ones(2)
+        parts = push, follow, jnp.ones(2)
         J = _jacobian(*parts, graph, T)
         expected = _by_unknowns(eqx.Partial(gradients._imbalance, *parts), graph, T)
         _agree(J, expected)
