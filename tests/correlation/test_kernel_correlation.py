@@ -1,5 +1,6 @@
 """`KernelCorrelation` against a NumPy objective and SciPy's optimiser."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -283,12 +284,12 @@ def test_solvers_of_optimistix_end_at_the_best_pose(solver):
     source, target = blob(N, 2), blob(M, 2, seed=1)
     target = move(T_COPY, target)
     with jax.enable_x64(True):
-        p, q = jnp.asarray(source, float), jnp.asarray(target, float)
-        sol = KernelCorrelation(WIDTH, tolerance=1e-6, solver=solver).solve(
-            PointCloud(p, 0 * p, jnp.ones(N, bool)),
-            PointCloud(q, 0 * q, jnp.ones(M, bool)),
-            None,
+        clouds = (
+            PointCloud(*map(jnp.asarray, (x, 0 * x, np.ones(len(x), bool))))
+            for x in (source.astype(float), target.astype(float))
         )
+        method = KernelCorrelation(WIDTH, tolerance=1e-6, solver=solver)
+        sol = eqx.filter_jit(method.solve)(*clouds, None)
     assert sol.status == Status.CONVERGED
     best = _best(np.eye(3), source, target)
     assert np.abs(best - np.eye(3)).max() > 0.1

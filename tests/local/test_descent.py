@@ -1,5 +1,6 @@
 """ICP stepped by hand."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 from helpers import blob, motion, move, pose_error
@@ -16,12 +17,13 @@ def test_steps_by_hand_lead_where_the_method_does():
     turn[:2, 2] = target.mean(0) - turn[:2, :2] @ target.mean(0)
     guess = turn @ truth
     method = jr.ICP(jr.PointToPoint(), max_correspondence_distance=40.0)
-    descending, state = method.iteration(source, target, guess)
+    descending, state = eqx.filter_jit(method.iteration)(source, target, guess)
+    step = eqx.filter_jit(descending.step)
     frames = descending.problem.frames
     assert frames is not None
     np.testing.assert_allclose(frames.leave(state.T), guess, atol=1e-2)
     while not descending.terminate(state):
-        state = descending.step(state)
+        state = step(state)
     sol = jr.register(source, target, method, init=guess)
     assert int(state.num_steps) == int(sol.num_steps)
     np.testing.assert_allclose(frames.leave(state.T), sol.T_target_source, atol=0.02)

@@ -109,15 +109,20 @@ def test_multi_start_keeps_every_single_descent():
     problem = _pair(2).problem
     found = _search(method, problem).particles
     optimiser = LocalOptimiser(method.residual, method.kernel, method.step)
-    widths = 0.3 * 0.2 ** jnp.linspace(0, 1, 8)
-    descend = jax.jit(lambda T: optimiser.repeat(problem, T, widths))
+    widths = (0.3 * 0.2 ** np.linspace(0, 1, 8)).astype(np.float32)
+
+    @jax.jit
+    def descend(T):
+        end = optimiser.repeat(problem, T, widths)
+        return end, BoundedEnergy()(match(problem, end), widths[-1])
+
+    ends = np.asarray(found.T_target_source)
     for i, T in enumerate(STARTS[:12]):
-        end = descend(jnp.asarray(T, jnp.float32))
-        np.testing.assert_allclose(found.T_target_source[i], end, atol=1e-4)
-        value = BoundedEnergy()(match(problem, end), widths[-1])
+        end, value = descend(T.astype(np.float32))
+        np.testing.assert_allclose(ends[i], end, atol=1e-4)
         assert float(found.energy[i]) == pytest.approx(float(value), abs=1e-4)
     np.testing.assert_allclose(np.exp(found.log_weight), 1 / P, rtol=1e-5)
-    best = found.T_target_source[np.argmin(found.energy)]
+    best = ends[np.argmin(found.energy)]
     np.testing.assert_array_equal(found.measurement, best)
 
 
@@ -182,7 +187,8 @@ def test_draws_end_when_several_agree_and_not_on_a_symmetric_object():
 
 
 def _paper(d: int, dynamics: AbstractDynamics, num_times: int) -> ParticleFilter:
-    starts = GaussianPrior(0.5, 0.5).draw(KEY, P, d, None, jnp.float32)
+    prior = GaussianPrior(0.5, 0.5)
+    starts = jax.jit(lambda: prior.draw(KEY, P, d, None, jnp.float32))()
     prior = GivenParticles(starts)
     return sandhu2010(d, P, dynamics, prior=prior, num_times=num_times)
 
@@ -282,11 +288,16 @@ def test_energies_that_tell_nothing_leave_uniform_weights(value):
 
 
 def test_poses_are_judged_by_the_same_points_whatever_number_finds_them():
-    points, mask = jnp.asarray(blob(9000, 3)), jnp.ones(9000, bool)
-    usual = ParticleFilter().prepare(points, mask).with_spacing()
+    points, mask = blob(9000, 3), np.ones(9000, bool)
+
+    @eqx.filter_jit
+    def prepared(method: ParticleFilter) -> PointCloud:
+        return method.prepare(jnp.asarray(points), jnp.asarray(mask))
+
+    usual = eqx.filter_jit(PointCloud.with_spacing)(prepared(ParticleFilter()))
     assert usual.judged is None
     for num in (1024, 6000, 9000):
-        cloud = ParticleFilter(max_points=num).prepare(points, mask)
+        cloud = prepared(ParticleFilter(max_points=num))
         assert len(cloud.mask) == num
         for name in ("points", "normals", "mask", "spacing"):
             found = getattr(cloud.as_judged, name)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
+from pairs import Centroids
 
 import jaxreg as jr
 from jaxreg import robust
@@ -349,10 +350,10 @@ class Nothing(jr.AbstractRegistrar):
         return self
 
     def prepare(self, points, mask):
-        return jr.ICP().prepare(points, mask)
+        return Centroids().prepare(points, mask)
 
     def solve(self, source, target, init, key):
-        found = jr.ICP(jr.PointToPoint(), max_steps=1).solve(source, target, init)
+        found = Centroids().solve(source, target, init)
         assert init is not None
         eye = jnp.eye(len(init), dtype=init.dtype)
         T = {"stretched": 2 * init, "fixed": eye}[self.twist]
