@@ -210,8 +210,8 @@ def test_statuses():
     key = jax.random.key(0)
     line = np.linspace(0, 1, N, dtype=np.float32)[:, None] * np.ones(3, np.float32)
 
-    def status(s, t, method: AbstractRegistrar = FILTER):
-        sol = jr.register(s, t, method, key=key)
+    def status(s, t, method: AbstractRegistrar = FILTER, init=None):
+        sol = jr.register(s, t, method, init, key=key)
         assert np.isfinite(np.asarray(sol.T_target_source)).all()
         return Status(int(sol.status))
 
@@ -219,7 +219,8 @@ def test_statuses():
     assert status(point, target) == Status.TOO_FEW_POINTS
     assert status(source, np.full_like(target, np.nan)) == Status.TOO_FEW_POINTS
     assert status(line, target) == Status.LOW_OVERLAP
-    assert status(source, target, jr.ICP(max_steps=1)) == Status.MAX_STEPS
+    restless = jr.ICP(tolerance=0.0)
+    assert status(source, target, restless, np.eye(4)) == Status.MAX_STEPS
 
 
 def _cylinder(num: int, seed: int) -> np.ndarray:
