@@ -33,9 +33,14 @@ def scene(n: int = 160, seed: int = 0) -> Arrays:
     return points, normals, rng.uniform(size=n) > 0.1
 
 
+@jax.jit
+def _described(cloud: PointCloud, radius: jax.Array) -> Described:
+    return described(cloud, jnp.asarray(radius), NEIGHBOURS)
+
+
 def features(points: np.ndarray, normals: np.ndarray, mask: np.ndarray) -> Described:
     cloud = PointCloud(jnp.asarray(points), jnp.asarray(normals), jnp.asarray(mask))
-    return described(cloud, jnp.asarray(RADIUS), NEIGHBOURS)
+    return _described(cloud, RADIUS)
 
 
 def histograms(found: Described) -> np.ndarray:

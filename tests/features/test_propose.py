@@ -74,12 +74,11 @@ def test_the_most_agreed_pose_is_right(clouds):
 
 def test_clouds_described_before_propose_the_same(clouds):
     source, target, _, spacing = clouds
-    wanted = propose(source, target, spacing)
-    here, there = (
-        with_features(jr.ParticleFilter(), x, spacing) for x in (source, target)
-    )
+    wanted = looked_for(source, target, spacing, YES)[0]
+    describe = eqx.filter_jit(with_features)
+    here, there = (describe(jr.ParticleFilter(), x, spacing) for x in (source, target))
     assert here.described is not None
-    found = propose(here, there, spacing)
+    found = jax.jit(propose)(here, there, spacing)
     # Correspondences that are as good as each other may change their places.
     np.testing.assert_array_equal(
         np.sort(found.num_agreeing), np.sort(wanted.num_agreeing)
