@@ -1,5 +1,6 @@
 """Dynamics: Eq. 6-8 as moments of many draws."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,11 +41,16 @@ def _particles(num: int = P) -> Particles:
     )
 
 
+@eqx.filter_jit
+def _predicted(dynamics, particles, time, seed=0):
+    """Poses, and the tangents to them from the particles."""
+    T = dynamics(jax.random.key(seed), particles, jnp.asarray(time))
+    return T, jax.vmap(decoupled_error)(T, particles.T_target_source)
+
+
 def _steps(dynamics) -> np.ndarray:
     """`(draws, P, 6)` tangents from the particles to their predictions."""
-    particles = _particles(P * DRAWS)
-    T = dynamics(jax.random.key(0), particles, jnp.asarray(TIME))
-    step = jax.vmap(decoupled_error)(T, particles.T_target_source)
+    _, step = _predicted(dynamics, _particles(P * DRAWS), TIME)
     return np.asarray(step, np.float64).reshape(DRAWS, P, 6)
 
 
@@ -56,10 +62,9 @@ def test_without_dynamics_particles_stay():
 
 def test_constant_velocity_repeats_the_motion_error():
     particles = _particles()
-    first = ConstantVelocity()(jax.random.key(0), particles, jnp.asarray(TIME))
-    again = ConstantVelocity()(jax.random.key(1), particles, jnp.asarray(TIME))
+    first, step = _predicted(ConstantVelocity(), particles, TIME)
+    again, _ = _predicted(ConstantVelocity(), particles, TIME, 1)
     np.testing.assert_array_equal(first, again)
-    step = jax.vmap(decoupled_error)(first, particles.T_target_source)
     np.testing.assert_allclose(step, ERROR, atol=1e-6)
 
 
@@ -85,7 +90,7 @@ def test_the_diffusion_dies_with_the_motion_error(spread):
     T = jnp.asarray(np.stack([motion(i, 2) for i in range(P)]), jnp.float32)
     still = Particles.at(T, P, num_times=3)
     dynamics = StochasticDynamics(spread=spread)
-    moved = dynamics(jax.random.key(0), still, jnp.asarray(0))
+    moved, _ = _predicted(dynamics, still, 0)
     np.testing.assert_allclose(moved, T, atol=1e-6)
     assert dynamics.needs_path == isinstance(spread, PathSpread)
 
@@ -93,10 +98,8 @@ def test_the_diffusion_dies_with_the_motion_error(spread):
 def test_particles_that_resampling_drops_widen_the_measured_spread():
     before = _particles()
     kept = before.rows(jnp.zeros(P * DRAWS, int)).told(before)
-    T = StochasticDynamics(spread=MeasuredSpread())(
-        jax.random.key(0), kept, jnp.asarray(TIME)
-    )
-    step = np.asarray(jax.vmap(decoupled_error)(T, kept.T_target_source))
+    _, step = _predicted(StochasticDynamics(spread=MeasuredSpread()), kept, TIME)
+    step = np.asarray(step)
     found = step.T @ step / len(step)
     # The third had no weight: it was not in use.
     S = np.mean(ERROR[:2, :, None] * ERROR[:2, None, :], axis=0)
@@ -112,9 +115,7 @@ def test_the_ensemble_ignores_particles_without_weight():
         broken.energy,
         broken.log_weight,
     )
-    T = StochasticDynamics(spread=EnsembleSpread())(
-        jax.random.key(0), broken, jnp.asarray(1)
-    )
+    T, _ = _predicted(StochasticDynamics(spread=EnsembleSpread()), broken, 1)
     assert np.isfinite(np.asarray(T)).all()
 
 

@@ -1,5 +1,6 @@
 """Energies against NumPy in float64, and what a measurement does."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +40,14 @@ def _problem() -> Problem:
     return Problem.of(source, target, BruteForce.build(target.points))
 
 
+@eqx.filter_jit
+def _energy_at(energy, T, width):
+    return energy(match(_problem(), jnp.asarray(T)), jnp.float32(width))
+
+
+_measure = eqx.filter_jit(measure)
+
+
 @pytest.mark.parametrize("kind", ["bounded", "squared", "absolute"])
 def test_energies_are_their_equations(kind):
     T = motion(3, 3, angle=0.3, shift=0.1)
@@ -58,19 +67,22 @@ def test_energies_are_their_equations(kind):
         "squared": (SquaredEnergy(), distance**2),
         "absolute": (AbsoluteEnergy(0.05), np.sqrt(distance**2 + 0.05**2)),
     }[kind]
-    found = energy(
-        match(_problem(), jnp.asarray(T, jnp.float32)), jnp.asarray(WIDTH, jnp.float32)
-    )
+    found = _energy_at(energy, T.astype(np.float32), WIDTH)
     assert float(found) == pytest.approx(value[MASK].mean(), rel=1e-4)
 
 
 def test_only_the_bounded_energy_is_bounded():
-    problem, width = _problem(), jnp.asarray(0.1)
-    there, far = (match(problem, jnp.eye(4).at[0, 3].set(x)) for x in (0.0, 1e6))
-    assert abs(float(BoundedEnergy()(there, width))) < 1e-6
-    assert 0.99 < float(BoundedEnergy()(far, width)) <= 1
-    assert float(SquaredEnergy()(far, width)) == pytest.approx(1e12, rel=1e-3)
-    assert float(AbsoluteEnergy()(far, width)) == pytest.approx(1e6, rel=1e-3)
+    here = np.eye(4, dtype=np.float32)
+    far = here.copy()
+    far[0, 3] = 1e6
+    assert abs(float(_energy_at(BoundedEnergy(), here, 0.1))) < 1e-6
+    bounded, squared, absolute = (
+        float(_energy_at(of, far, 0.1))
+        for of in (BoundedEnergy(), SquaredEnergy(), AbsoluteEnergy())
+    )
+    assert 0.99 < bounded <= 1
+    assert squared == pytest.approx(1e12, rel=1e-3)
+    assert absolute == pytest.approx(1e6, rel=1e-3)
 
 
 def test_measurement_descends_and_reports_what_it_moved():
@@ -80,7 +92,7 @@ def test_measurement_descends_and_reports_what_it_moved():
     start = Particles.at(jnp.asarray(T, jnp.float32), 8)
     T = start.T_target_source
     width = jnp.asarray(0.2)
-    out = measure(
+    out = _measure(
         problem,
         optimiser,
         energy,
@@ -91,10 +103,10 @@ def test_measurement_descends_and_reports_what_it_moved():
         num_steps=5,
         batch_size=2,
     )
-    before = jax.vmap(lambda T: energy(match(problem, T), width))(T)
+    before = jax.jit(jax.vmap(lambda T: energy(match(problem, T), width)))(T)
     assert np.all(np.asarray(out.energy)[:6] < np.asarray(before)[:6])
     np.testing.assert_array_equal(out.energy[6:], np.inf)
-    moved = jax.vmap(decoupled_error)(out.T_target_source, T)
+    moved = jax.jit(jax.vmap(decoupled_error))(out.T_target_source, T)
     np.testing.assert_allclose(out.motion_error, moved, atol=1e-6)
     best = np.argmin(out.energy)
     np.testing.assert_array_equal(out.measurement, out.T_target_source[best])
@@ -119,7 +131,7 @@ class _ByWeight(AbstractStep):
 @pytest.mark.parametrize("num_steps", [1, 2, 5])
 def test_kernel_widths_go_from_the_first_to_the_last_by_one_factor(num_steps):
     T = jnp.eye(4)[None]
-    out = measure(
+    out = _measure(
         _problem(),
         LocalOptimiser(PointToPoint(), _Width(), _ByWeight()),
         SquaredEnergy(),

@@ -1,5 +1,6 @@
 """Priors: moments of many draws, and frames of given particles."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,19 +18,29 @@ KEY = jax.random.key(0)
 FRAMES = Frames(jnp.array([1.0, 2, 3]), jnp.array([0, -5.0, 0]), jnp.asarray(2.0))
 
 
+@eqx.filter_jit
+def _draw(prior, num, d, init=None):
+    return prior.draw(KEY, num, d, init, jnp.float32)
+
+
+@jax.jit
+def _tangents(T_drawn, T):
+    return jax.vmap(decoupled_error, (0, None))(T_drawn, T)
+
+
 def test_gaussian_prior_keeps_the_guess_and_spreads_around_it():
     T = jnp.asarray(motion(2, 3), jnp.float32)
-    drawn = GaussianPrior(0.2, 0.1).draw(KEY, NUM, 3, T, jnp.float32)
+    drawn = _draw(GaussianPrior(0.2, 0.1), NUM, 3, T)
     assert pose_error(drawn[0], T)[0] < 1e-3
-    tangent = np.asarray(jax.vmap(decoupled_error, (0, None))(drawn, T))
+    tangent = np.asarray(_tangents(drawn, T))
     np.testing.assert_allclose(tangent.std(0), [0.2] * 3 + [0.1] * 3, rtol=0.1)
-    alone = GaussianPrior(0.2, 0.1).draw(KEY, 8, 3, None, jnp.float32)
+    alone = _draw(GaussianPrior(0.2, 0.1), 8, 3)
     np.testing.assert_allclose(alone[0], np.eye(4), atol=1e-6)
 
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_uniform_prior_has_no_preferred_rotation(d):
-    drawn = np.asarray(UniformPrior(0.4).draw(KEY, NUM, d, None, jnp.float32))
+    drawn = np.asarray(_draw(UniformPrior(0.4), NUM, d))
     R, t = drawn[:, :d, :d], drawn[:, :d, d]
     np.testing.assert_allclose(R.mean(0), 0, atol=0.05)
     np.testing.assert_allclose(
@@ -38,8 +49,9 @@ def test_uniform_prior_has_no_preferred_rotation(d):
     # E[R_ij^2] = 1 / d over all of SO(d).
     np.testing.assert_allclose((R**2).mean(0), 1 / d, atol=0.03)
     np.testing.assert_allclose(t.std(0), 0.4, rtol=0.05)
-    init = jnp.eye(d + 1).at[0, d].set(5)
-    around = UniformPrior(0.4).draw(KEY, NUM, d, init, jnp.float32)
+    init = np.eye(d + 1, dtype=np.float32)
+    init[0, d] = 5
+    around = np.asarray(_draw(UniformPrior(0.4), NUM, d, jnp.asarray(init)))
     assert float(around[:, 0, d].mean()) == pytest.approx(5, abs=0.05)
 
 
@@ -59,7 +71,7 @@ def test_given_particles_are_taken_as_they_are_and_follow_the_frames():
 
 def test_level_scanners_turn_about_the_vertical_and_hardly_tilt():
     prior = PartialPose(up=(0, 3, 4), tilt=0.05)
-    R = np.asarray(prior.draw(KEY, NUM, 3, None, jnp.float32))[:, :3, :3]
+    R = np.asarray(_draw(prior, NUM, 3))[:, :3, :3]
     up = np.array([0, 0.6, 0.8])
     tilt = np.linalg.norm(R @ up - up, axis=1)
     # The root mean square over two horizontal axes.
@@ -82,10 +94,8 @@ def test_positions_are_those_of_the_scanners():
     known = np.array([3.0, 4, 2])
     prior = PartialPose(position=known, deviation=0.1, **SCANNERS)
     for drawn in (
-        prior.draw(KEY, NUM, 3, None, jnp.float32),
-        jax.vmap(FRAMES.leave)(
-            prior.in_frames(FRAMES).draw(KEY, NUM, 3, None, jnp.float32)
-        ),
+        _draw(prior, NUM, 3),
+        jax.jit(jax.vmap(FRAMES.leave))(_draw(prior.in_frames(FRAMES), NUM, 3)),
     ):
         found = _offset(drawn)
         np.testing.assert_allclose(found.mean(0), known, atol=0.01)
@@ -94,13 +104,13 @@ def test_positions_are_those_of_the_scanners():
 
 def test_positions_of_unknown_heading_have_a_length_and_a_height():
     known = {"position": (3.0, 4, 2), "deviation": 0.1, "oriented": False}
-    anyhow = PartialPose(**known, **SCANNERS).draw(KEY, NUM, 3, None, jnp.float32)
+    anyhow = _draw(PartialPose(**known, **SCANNERS), NUM, 3)
     found = _offset(anyhow)
     length = np.sqrt(29.0)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1).mean(), length, rtol=0.01)
     np.testing.assert_allclose(found.mean(0), 0, atol=0.2)
     level = PartialPose(up=(0, 0, 1), **known, **SCANNERS)
-    found = _offset(level.draw(KEY, NUM, 3, None, jnp.float32))
+    found = _offset(_draw(level, NUM, 3))
     flat = np.linalg.norm(found[:, :2], axis=1)
     # A tilt of 0.035 moves the height by that share of the length, too.
     np.testing.assert_allclose([flat.mean(), found[:, 2].mean()], [5, 2], atol=0.03)
@@ -160,6 +170,6 @@ def test_spreads_and_poses_that_make_no_sense_are_refused(make, error, words):
 
 
 def test_one_spread_may_be_zero():
-    T = GaussianPrior(0.3, 0.0).draw(KEY, 50, 2, None, jnp.float32)
+    T = np.asarray(_draw(GaussianPrior(0.3, 0.0), 50, 2))
     np.testing.assert_allclose(T[:, :2, :2] - np.eye(2), 0, atol=1e-6)
     assert float(T[:, :2, 2].std()) > 0.2
