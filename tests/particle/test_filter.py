@@ -13,7 +13,7 @@ from jaxtyping import Array
 from scipy.spatial import KDTree
 
 from jaxreg import Status
-from jaxreg._core.arrays import traced
+from jaxreg._core.arrays import cast_floats, traced
 from jaxreg.cloud import PointCloud
 from jaxreg.local import LocalOptimiser
 from jaxreg.matching import Problem, match
@@ -86,6 +86,10 @@ def _conclude(pair, found):
         refine_steps=0,
         min_log_evidence=0.0,
     )
+
+
+def _diffusion(spread) -> StochasticDynamics:
+    return StochasticDynamics(spread=spread)
 
 
 def _small(**parts) -> ParticleFilter:
@@ -360,34 +364,35 @@ def test_as_many_given_particles_as_the_method_starts_with():
 
 
 @pytest.mark.parametrize(
-    "method",
+    ("method", "concludes"),
+    # What follows a search is the same for all: with and without refinement.
     [
-        _small(prior=None, resampler=Residual(0.5), energy=AbsoluteEnergy()),
-        _small(
-            dynamics=StochasticDynamics(spread=EnsembleSpread()), resampler=Stratified()
-        ),
-        _small(
-            dynamics=StochasticDynamics(spread=PathSpread()), resampler=Multinomial()
-        ),
-        MultiStart(num_starts=P, num_steps=2, refine_steps=0),
-        sandhu2010(2, P, ConstantVelocity()),
+        (_small(prior=None, resampler=Residual(0.5), energy=AbsoluteEnergy()), True),
+        (_small(dynamics=_diffusion(EnsembleSpread()), resampler=Stratified()), False),
+        (_small(dynamics=_diffusion(PathSpread()), resampler=Multinomial()), False),
+        (MultiStart(num_starts=P, num_steps=2, refine_steps=0), True),
+        (sandhu2010(2, P, ConstantVelocity()), False),
     ],
     ids=["residual", "ensemble", "path", "multi-start", "paper"],
 )
-def test_parts_go_together_and_keep_the_dtype(method):
+def test_parts_go_together_and_keep_the_dtype(method, concludes):
     with jax.enable_x64(True):
         for dtype in (jnp.float32, jnp.float64):
             pair = jax.tree.map(
                 lambda x: x.astype(dtype) if x.dtype.kind == "f" else x,  # noqa: B023
                 _pair(2),
             )
-            out = eqx.filter_eval_shape(method.solve_indexed, *_parts(pair), None, KEY)
+            clouds = pair.source, pair.target, pair.target_index
+            if concludes:
+                out = eqx.filter_eval_shape(method.solve_indexed, *clouds, None, KEY)
+            else:
+                # As `solve_indexed` has its numbers cast before.
+                cast = cast_floats(method, dtype)
+                out = eqx.filter_eval_shape(cast.search, KEY, pair.problem, None)
+                assert out.finished.dtype == out.sure.dtype == bool
+                out = out.particles, out.num_steps, out.trace
             kinds = {x.dtype for x in jax.tree.leaves(out)}
             assert kinds == {jnp.dtype(dtype), jnp.dtype(jnp.int32)}
-
-
-def _parts(pair: Pair):
-    return pair.source, pair.target, pair.target_index
 
 
 def _lump(n: int, kind: int, seed: int) -> np.ndarray:
