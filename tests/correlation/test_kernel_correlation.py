@@ -284,12 +284,12 @@ def test_solvers_of_optimistix_end_at_the_best_pose(solver):
     source, target = blob(N, 2), blob(M, 2, seed=1)
     target = move(T_COPY, target)
     with jax.enable_x64(True):
-        clouds = (
-            PointCloud(*map(jnp.asarray, (x, 0 * x, np.ones(len(x), bool))))
-            for x in (source.astype(float), target.astype(float))
-        )
+        valid = [jnp.asarray(np.ones(n, bool)) for n in (N, M)]
+        p, q = (jnp.asarray(x.astype(float)) for x in (source, target))
+        zero = [jnp.asarray(np.zeros((n, 2))) for n in (N, M)]
+        here, there = PointCloud(p, zero[0], valid[0]), PointCloud(q, zero[1], valid[1])
         method = KernelCorrelation(WIDTH, tolerance=1e-6, solver=solver)
-        sol = eqx.filter_jit(method.solve)(*clouds, None)
+        sol = eqx.filter_jit(method.solve)(here, there, None)
     assert sol.status == Status.CONVERGED
     best = _best(np.eye(3), source, target)
     assert np.abs(best - np.eye(3)).max() > 0.1

@@ -31,8 +31,11 @@ def correspondences(
     )
     order = rng.permutation(n)
     arrays = (x[order] for x in (source, normals, target, others))
-    four = [jnp.asarray(x.astype(np.float32)) for x in arrays]
-    pairs = Correspondences(*four, jnp.asarray(np.ones(n, bool)))
+    source, normals, target, others = (
+        jnp.asarray(x.astype(np.float32)) for x in arrays
+    )
+    valid = jnp.asarray(np.ones(n, bool))
+    pairs = Correspondences(source, normals, target, others, valid)
     return pairs, T
 
 

@@ -39,7 +39,7 @@ def test_agrees_with_scipy_on_weighted_points(seed):
 
 def test_never_returns_a_reflection():
     source = np.random.default_rng(0).standard_normal((N, 3)).astype(np.float32)
-    T = _kabsch(source, source * np.float32([1, 1, -1]))
+    T = _kabsch(source, source * np.array([1, 1, -1], np.float32))
     assert np.linalg.det(np.asarray(T)[:3, :3]) == pytest.approx(1, abs=1e-5)
 
 
