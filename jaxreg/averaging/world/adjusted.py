@@ -6,8 +6,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxreg._core.checks import shown
+from jaxreg._core.programs import kept_program
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.world.adjustment import Adjustment
 from jaxreg.averaging.world.arguments import check_known
@@ -70,13 +72,12 @@ def as_adjusted(
         T[:, :-1, -1] -= known.origin
     T = jnp.asarray(T, graph.T_i_j.dtype)
     own = solution.edge_weight
-    whole, told_weight = graph, jnp.zeros(0) if weight is None else weight
-    poses = known.poses
+    told_weight = jnp.zeros(0) if weight is None else weight
     if num:
-        rows = poses, known.points, known.levels
-        all_of_it = Adjustment(graph, *rows, own, solution.placed)
-        whole, poses, _ = all_of_it.whole(T)
-    whole = anchored(whole, poses)
+        rows = known.poses, known.points, known.levels
+        whole = _whole(Adjustment(graph, *rows, own, solution.placed), T)
+    else:
+        whole = anchored(graph, known.poses)
     eye = jnp.eye(graph.dim + 1, dtype=T.dtype)[None]
     at = lambda s: (s.T_world_i, s.edge_weight, s.placed, s.prior_weight)  # noqa: E731
     placed = jnp.append(True, solution.placed)
@@ -84,3 +85,10 @@ def as_adjusted(
     new = jnp.concatenate([eye, T]), edge_weight, placed, None
     solution = eqx.tree_at(at, solution, new, is_leaf=lambda x: x is None)
     return whole, solution, 1
+
+
+@kept_program
+def _whole(adjustment: Adjustment, T: Float[Array, "v D D"]) -> PoseGraph:
+    """Edges and what is known as one graph whose frame 0 is the world."""
+    graph, known, _ = adjustment.whole(T)
+    return anchored(graph, known)
