@@ -113,7 +113,7 @@ def test_a_guess_beyond_all_numbers_on_the_map_has_a_status():
     assert int(sol.status) == Status.NON_FINITE
 
 
-def _street(seed, num=4000, ground=0.9):
+def _street(seed, num=10_000, ground=0.9):
     """A street corner: the ground, and walls and posts with the other points."""
     rng = np.random.default_rng(seed)
     flat = np.zeros((int(ground * num), 3))

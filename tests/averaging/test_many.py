@@ -45,9 +45,11 @@ def _graphs(sizes, outliers: float = 0.1, d: int = 3):
     ]
 
 
-@pytest.mark.parametrize(("method", "d"), [(PLAIN, 3), (jr.Correntropy(), 2)], ids=repr)
-def test_padding_changes_an_answer_by_rounding_only(method, d):
-    graphs = _graphs(SIZES[:2], d=d)
+@pytest.mark.parametrize(
+    "method", [PLAIN, jr.Correntropy()], ids=lambda m: type(m).__name__
+)
+def test_padding_changes_an_answer_by_rounding_only(method):
+    graphs = _graphs(SIZES[:2])
     padded = jr.average(graphs, method)[0]  # to the poses and edges of the other
     alone = average_graph(graphs[0], method, None, None)
     assert int(padded.status) == int(alone.status) == Status.CONVERGED
