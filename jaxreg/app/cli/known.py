@@ -123,11 +123,11 @@ def with_names(
 ) -> list[dict[str, Any]]:
     """The entries, control points of `--control` by the names that the file has."""
     names = [] if command.control is None else names_of_control(command.control)
-    own = [entry for entry in entries if entry["kind"] == "control"]
     # Those that the graph's own file knows come before.
-    told = [""] * (len(own) - len(names)) + names
-    name = dict(zip(map(id, own), told, strict=True))
-    return [x | {"name": name[id(x)]} if name.get(id(x)) else x for x in entries]
+    before = sum(entry["kind"] == "control" for entry in entries) - len(names)
+    told = iter([""] * before + names)
+    each = ((x, next(told) if x["kind"] == "control" else "") for x in entries)
+    return [x | {"name": name} if name else x for x, name in each]
 
 
 def control_entry(

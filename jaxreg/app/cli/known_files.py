@@ -101,7 +101,7 @@ def _rows(path: Path, named: bool = False) -> Iterator[_Row]:
             name, *words = words
         if not all(map(_is_number, words)):
             raise InputError(f"{place}: not numbers after the frame: {text}")
-        numbers = np.array(words, np.float64)
+        numbers = np.array([float(word) for word in words])
         if not np.isfinite(numbers).all():
             raise InputError(f"{place}: wanted finite numbers.")
         yield _Row(place, frame, name.strip(), numbers)
