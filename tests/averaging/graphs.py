@@ -4,6 +4,8 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial.transform import Rotation
 
+from jaxreg.graph import PoseGraph
+
 
 def motions(R: np.ndarray, t: np.ndarray) -> np.ndarray:
     d = t.shape[-1]
@@ -117,3 +119,30 @@ def noisy_grid(
         0.1 * noise * rng.normal(size=(len(edges), 3)),
     )
     return X, edges, np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ error
+
+
+def crooked_path(seed: int, num: int, closures: int, false: int, told: bool):
+    """Graph of a path with closures in no order, some of them false; which."""
+    rng = np.random.default_rng(seed)
+    shift = np.eye(3)[:1].repeat(num, axis=0)
+    X = [np.eye(4)]
+    for T in motions(rotations(rng, num - 1, 3, 0.35), shift[1:]):
+        X.append(X[-1] @ T)
+    X = np.array(X)
+    low = rng.integers(0, num - 10, closures)
+    high = np.minimum(num - 1, low + rng.integers(5, num // 2, closures))
+    chain = np.stack([np.arange(num - 1), np.arange(1, num)], axis=1)
+    edges = np.concatenate([chain, np.stack([low, high], axis=1)])
+    noise = motions(
+        rotations(rng, len(edges), 3, 0.009), 0.01 * rng.normal(size=(len(edges), 3))
+    )
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ noise
+    wrong = np.zeros(len(edges), bool)
+    wrong[num - 1 + rng.permutation(closures)[:false]] = True
+    T[wrong] = T[wrong] @ motions(
+        rotations(rng, false, 3, 1.5), 5 * rng.normal(size=(false, 3))
+    )
+    each = np.diag(np.repeat([0.01**-2, 0.009**-2], 3)).astype(np.float32)
+    information = np.tile(each, (len(edges), 1, 1)) if told else None
+    args = (edges, T.astype(np.float32), num, None, information)
+    return PoseGraph.from_edges(*args), wrong

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from jaxreg.graph import PoseGraph
 from jaxreg.io import read_g2o
 from jaxreg.linear.laplacian import DENSE_LIMIT
 from jaxreg.metrics import align_poses, chordal_objective, translation_errors
-from tests.averaging.graphs import motions, rotations
+from tests.averaging.graphs import crooked_path, motions, rotations
 from tests.helpers import data_dir
 
 
@@ -74,6 +76,21 @@ def test_false_closures_of_a_large_graph_are_found():
         # Neighbouring places look alike to within the last width of the kernel.
         assert np.mean(trusted[false]) < 0.1
         assert np.mean(trusted[~false]) > 0.99
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_closures_of_a_path_that_hardly_resists_are_told_apart(told: bool):
+    # Along a hundred steps a turn by a right angle is a degree at each.
+    for seed in range(3):
+        graph, wrong = crooked_path(seed, 300, 30, 9, told)
+        solution = average(graph)
+        np.testing.assert_array_equal(np.asarray(solution.edge_weight) < 0.5, wrong)
+    # Steps without closures over them hold all but exactly: they tell nothing of noise.
+    graph, _ = crooked_path(0, 300, 30, 0, told)
+    few = np.arange(graph.num_edges) < 299 + 5
+    graph = dataclasses.replace(graph, weight=graph.weight * few)
+    trusted = np.asarray(average(graph).edge_weight) > 0.5
+    assert trusted[few].all()
 
 
 @pytest.mark.data

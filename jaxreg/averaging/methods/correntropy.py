@@ -17,7 +17,7 @@ from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.methods.annealed import annealed, better_start, or_start
 from jaxreg.averaging.methods.graduated import graduated
-from jaxreg.averaging.start.closures import without_lone_closures
+from jaxreg.averaging.start.closures import without_doubtful_closures
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus
 from jaxreg.averaging.steps.iterate import solution_of
 from jaxreg.graph.pose_graph import PoseGraph
@@ -85,7 +85,7 @@ class Correntropy(AbstractAverager):
     def _large(
         self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
     ) -> AveragingSolution:
-        near = without_lone_closures(jax.lax.stop_gradient(graph))
+        near = without_doubtful_closures(jax.lax.stop_gradient(graph))
         if init is None:
             T_start = starting_poses(self.initialiser, near, None, key)
             better, _ = better_start(graph, T_start, near)

@@ -2,8 +2,9 @@
 
 Every edge counts by its information and by a Gaussian of its whitened error, whose
 width is halved from one that sees the right edges in spite of the drift of the start
-down to ten deviations of the edges inside it. Closures that no other confirms count
-little until the last width, where their error alone decides.
+down to ten deviations of the edges inside it. Closures that drift does not explain, or
+that no other confirms, count little until the last width, where their error alone
+decides.
 """
 
 from typing import NamedTuple
@@ -63,9 +64,9 @@ def graduated(
 
     Each start takes rounds of minimisation, at most `max_steps` steps each, under
     narrower and narrower kernels. The last that is tried takes no edge for wrong: from
-    the best end without a kernel. `near` is the graph `without_lone_closures`: those
-    are wrong as a rule, so they do not count in the wide kernels, and leaving them out
-    is no reason to search on.
+    the best end without a kernel. `near` is the graph `without_doubtful_closures`:
+    those are wrong as a rule, so they do not count in the wide kernels, and leaving
+    them out is no reason to search on.
 
     Gradients: implicit at the fixed point, widths are cut.
     """
@@ -214,7 +215,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         graph, present = self.graph, self.trusted
         open_edges = self._open(T) & present
         chained = jnp.sum(present & ~open_edges) > 0.5 * (graph.num_held - 1)
-        middle = nearest_rank(squares, present, 0.5) * self._spare_factor
+        middle = nearest_rank(squares, present, 0.5) * self._spare_factor(present)
         middle = middle / chi2_median(lie.tangent_dim(graph.dim))
         doubted = jnp.any((graph.weight > 0) & ~present)
         drift = nearest_rank(squares, open_edges, jnp.where(doubted, SETTLED, 0.25))
@@ -233,7 +234,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         w = jnp.where(self.graph.weight > 0, trust, 0)
         total = jnp.maximum(jnp.sum(w), jnp.finfo(w.dtype).tiny)
         mean = jnp.sum(w * squares) / total / lie.tangent_dim(self.graph.dim)
-        return jnp.sqrt(variance_inside(mean, width) * self._spare_factor)
+        return jnp.sqrt(variance_inside(mean, width) * self._spare_factor(trust))
 
     def _parts(self, T: Array, trust: Array) -> Float[Array, "2"]:
         """Of one component of the translation and of the rotation, by the middle edges.
@@ -243,11 +244,12 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         middle = middle_variances(self.graph, T, self._open(T) & (trust > 0.5))
         floor = 64 * jnp.finfo(middle.dtype).eps
         floor = floor * jnp.stack([self.graph.length_scale, jnp.ones_like(middle[1])])
-        return jnp.maximum(jnp.sqrt(middle * self._spare_factor), floor)
+        return jnp.maximum(jnp.sqrt(middle * self._spare_factor(trust)), floor)
 
-    @property
-    def _spare_factor(self) -> Float[Array, ""]:
-        count = jnp.sum(self.graph.weight > 0, dtype=self.counted.dtype)
+    def _spare_factor(self, trust: Array) -> Float[Array, ""]:
+        """How much more noise there is than the poses leave, by the edges inside."""
+        trust = jnp.where(self.graph.weight > 0, trust, 0)
+        count = jnp.sum(trust, dtype=self.counted.dtype)
         return spare_factor(self.graph, count)
 
 

@@ -1,4 +1,4 @@
-"""Closures of a sequence that others next to them confirm."""
+"""Closures of a sequence that its drift allows and others next to them confirm."""
 
 import equinox as eqx
 import jax
@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
 from jaxreg.averaging.start.cycles import NEUTRAL
+from jaxreg.averaging.start.drift import drifted
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
@@ -19,23 +20,26 @@ from jaxreg.linear.small import product
 _NEAR = 8
 
 
-def without_lone_closures(graph: PoseGraph) -> PoseGraph:
-    """The graph without closures that no other confirms; little of those it hangs on.
+def without_doubtful_closures(graph: PoseGraph) -> PoseGraph:
+    """The graph without closures that are likely false; little of those it hangs on.
 
-    A sequence passes a place again for some frames and closes several loops there,
+    Closures that are off by more than the drift of the sequence explains are false. And
+    a sequence passes a place again for some frames and closes several loops there,
     which agree with each other along the frames between their ends. False closures
-    stand alone as a rule. Where less than half of the closures are confirmed, or of the
-    frames measured from the one before, as in graphs that are no sequences, all keep
-    their weight. For starts: any weight of false closures bends a
-    long sequence, which hardly resists, so only those stay that join components.
+    stand alone as a rule. Where less than half of those that drift allows are
+    confirmed, or of the frames measured from the one before, as in graphs that are no
+    sequences, none is left out for standing alone. For starts: any weight of false
+    closures bends a long sequence, which hardly resists, so only those stay that join
+    components.
     """
     successive = jnp.abs(graph.edges[:, 0] - graph.edges[:, 1]) == 1
     closure = (graph.weight > 0) & ~successive
     supported = confirmed(graph, closure)
-    usual = jnp.sum(supported) >= jnp.sum(closure) / 2
+    far = drifted(graph, closure)
+    usual = jnp.sum(supported & ~far) >= jnp.sum(closure & ~far) / 2
     steps = jnp.sum((graph.weight > 0) & successive)
     usual = usual & (steps >= (graph.num_poses - 1) / 2)
-    doubted = closure & ~supported & usual
+    doubted = closure & usual & ~supported | far
     little = jnp.finfo(graph.weight.dtype).eps ** 0.5
     weight = jnp.where(doubted, little * graph.weight, graph.weight)
     tree = trees.maximum_spanning_tree(

@@ -145,6 +145,9 @@ def chi2_median(dof: int) -> float:
 
 
 def spare_factor(graph: PoseGraph, count: Float[Array, ""]) -> Float[Array, ""]:
-    """Edges over those that the poses do not use up, at most 4: poses take up noise."""
-    spare = jnp.maximum(count - (graph.num_held - 1), count / 4)
-    return jnp.where(count > 0, count / jnp.where(spare > 0, spare, 1), 1)
+    """Edges over those that the poses do not use up, at least one: they take up noise.
+
+    `count` is the sum of the trust of the edges.
+    """
+    spare = jnp.maximum(count - (graph.num_held - 1), 1)
+    return jnp.maximum(count / spare, 1)
