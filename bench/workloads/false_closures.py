@@ -36,9 +36,12 @@ from jaxreg.metrics import (
     rotation_errors,
     translation_errors,
 )
+from tests.averaging.graphs import crooked_path
 
 
-GRAPHS, SHARES, SEEDS = ("parking-garage", "intel"), (0.1, 0.3), 3
+GRAPHS, SHARES, SEEDS = ("parking-garage", "intel"), (0.1, 0.3, 0.5), 3
+#: A path that hardly resists: thirty closures, in no order.
+PATH = "path of 300"
 #: The share that the picture shows, and of how many poses and false closures.
 DRAWN, POSES, CLOSURES = 0.3, 300, 60
 #: Averagers, and whether they start at the odometry.
@@ -69,18 +72,14 @@ class Trial(NamedTuple):
 
 def cases(options: Options) -> Iterator[Case]:
     """A case per graph that is there and share of false closures."""
-    for name in GRAPHS:
-        path = options.data / "pose_graphs" / f"{name}.g2o"
-        if not path.exists():
-            continue
-        clean = read_g2o(path)
+    for name, text, clean in _graphs(options):
         T_clean = average(clean, PoseGraphLM(ChordalError())).T_world_i
         for share in SHARES:
             trials = [with_false_closures(clean, share, seed) for seed in range(SEEDS)]
             num = int(trials[0].false.sum())
             yield Case(
                 name=f"{name}, {share:.0%} false closures",
-                data=f"{path.name}, {clean.num_poses} poses, "
+                data=f"{text}, {clean.num_poses} poses, "
                 f"{int(closures(clean.edges).sum())} true closures and {num} false",
                 methods=methods(name, clean),
                 trials=[(trial,) for trial in trials],
@@ -88,6 +87,15 @@ def cases(options: Options) -> Iterator[Case]:
                 reference="GTSAM Geman-McClure, from odometry",
                 long=True,
             )
+
+
+def _graphs(options: Options) -> Iterator[tuple[str, str, PoseGraph]]:
+    """Name, what it is, and a graph: files that are there, and a path."""
+    for name in GRAPHS:
+        path = options.data / "pose_graphs" / f"{name}.g2o"
+        if path.exists():
+            yield name, path.name, read_g2o(path)
+    yield PATH, "generated path", crooked_path(0, 300, 30, 0, told=True)[0]
 
 
 def closures(edges: Any) -> np.ndarray:
