@@ -1,5 +1,7 @@
 """Closures against the drift of the frames between their ends."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -169,3 +171,20 @@ def test_a_closure_over_a_missing_step_is_not_judged():
     found = np.asarray(drifted(graph, jnp.arange(len(edges)) >= NUM - 1))
     assert not found[over].any()
     assert found.any()
+
+
+def test_what_edges_do_not_measure_allows_any_drift():
+    edges, T = walk(1)
+    T[NUM - 1 :] = T[NUM - 1 :] @ motions(
+        np.eye(3)[None], 20 * np.random.default_rng(0).normal(size=(CLOSURES, 3))
+    )
+    graph = graph_of(edges, T, dtype=np.float32)
+    of_turns = graph.information.at[:, :3].set(0).at[:, :, :3].set(0)
+    squares, _ = squared_misclosures(graph)
+    assert (np.asarray(squares)[NUM - 1 :] > 100).all()
+    bare = dataclasses.replace(graph, information=of_turns)
+    squares, known = squared_misclosures(bare)
+    assert known.all()
+    assert (np.asarray(squares)[NUM - 1 :] < 30).all()
+    nothing = dataclasses.replace(graph, information=jnp.zeros_like(of_turns))
+    assert np.isfinite(np.asarray(squared_misclosures(nothing)[0])).all()

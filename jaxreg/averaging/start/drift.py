@@ -119,15 +119,21 @@ def _along_numbers(graph: PoseGraph) -> _Leg:
     one = jnp.ones_like(graph.weight)
     unit = jnp.stack([graph.length_scale, jnp.ones_like(graph.length_scale)])
     W = precisions(graph, one, unit)
-    # Directions that an edge does not measure are measured badly.
-    eps = jnp.finfo(W.dtype).eps ** 0.5
-    most = jnp.max(jnp.diagonal(W, axis1=-2, axis2=-1), axis=-1)
-    W = W + eps * most[:, None, None] * jnp.eye(W.shape[-1], dtype=W.dtype)
-    there = _Leg(graph.T_i_j, inverse_semidefinite(W))
+    there = _Leg(graph.T_i_j, _covariances(W))
     turned = graph.edges[:, 0] > graph.edges[:, 1]
     return jax.tree.map(
         lambda a, b: jnp.where(turned[:, None, None], b, a), there, there.back()
     )
+
+
+def _covariances(W: Float[Array, "e k k"]) -> Float[Array, "e k k"]:
+    """Of information; what an edge does not measure it measures badly."""
+    diagonal = jnp.diagonal(W, axis1=-2, axis2=-1)
+    # A unit diagonal first, so that parts in other units keep their digits.
+    root = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    both = root[:, :, None] * root[:, None, :]
+    badly = jnp.finfo(W.dtype).eps ** 0.5 * jnp.eye(W.shape[-1], dtype=W.dtype)
+    return inverse_semidefinite(W * both + badly[None]) * both
 
 
 def _steps(
