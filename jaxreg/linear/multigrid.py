@@ -107,7 +107,7 @@ def _coarser(matrix: GraphLaplacian) -> tuple[_Level, GraphLaplacian]:
     i, j = edges[:, 0], edges[:, 1]
     diagonal = matrix.blocks()
     held = jnp.trace(diagonal, axis1=-2, axis2=-1) > 0
-    inverse = _block_inverses(diagonal)
+    inverse = block_inverses(diagonal)
     # The share of each edge in what holds its frames, whatever the coordinates.
     share = jnp.minimum(
         jnp.sum(inverse[i] * matrix.weight_at_i(), axis=(1, 2)),
@@ -163,7 +163,7 @@ def _middles(
     return total / jnp.maximum(num, 1)[:, None]
 
 
-def _block_inverses(A: Float[Array, "v k k"]) -> Float[Array, "v k k"]:
+def block_inverses(A: Float[Array, "v k k"]) -> Float[Array, "v k k"]:
     """Inverses of semidefinite blocks, zero where nothing holds."""
     diagonal = jnp.diagonal(A, axis1=-2, axis2=-1)
     # A unit diagonal first, so that parts in other units keep their digits.

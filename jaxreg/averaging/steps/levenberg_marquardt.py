@@ -36,7 +36,8 @@ from jaxreg.averaging.steps.iterate import STEP_TOLERANCE, pose_change
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
 from jaxreg.geometry import lie
 from jaxreg.linear.carried import carried
-from jaxreg.linear.multigrid import Multigrid, multigrid
+from jaxreg.linear.chains import Chained, near_inverse
+from jaxreg.linear.multigrid import Multigrid
 from jaxreg.linear.operator import GraphLaplacian
 from jaxreg.linear.small import product
 from jaxreg.linear.solvers import MultigridCG
@@ -68,7 +69,7 @@ class Minimum(NamedTuple):
 class Cycle(NamedTuple):
     """A multigrid cycle kept from step to step as long as it serves."""
 
-    inverse: Multigrid  # of the normal equations at this or an earlier step
+    inverse: Multigrid | Chained  # of the normal equations at this or an earlier step
     origin: Float[Array, "v d"]  # where its tangents are taken
     usual: Int[Array, ""]  # rounds that it first took, 0 where it is to be built
     moved: Float[Array, ""]  # how far poses have moved since, at most
@@ -77,7 +78,7 @@ class Cycle(NamedTuple):
 def no_cycle(problem: Problem, T: Float[Array, "v D D"]) -> Cycle:
     """One to be built."""
     origin = lie.translation(T)
-    shapes = jax.eval_shape(lambda: multigrid(_matrix(problem, T, origin, 0.0)[0]))
+    shapes = jax.eval_shape(lambda: near_inverse(_matrix(problem, T, origin, 0.0)[0]))
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     none = jnp.zeros((), T.dtype)
     return Cycle(blank, origin, jnp.asarray(0, jnp.int32), none)
@@ -166,7 +167,7 @@ class _Descent(AbstractIteration[tuple[Array, Cycle], _State]):
         origin = jnp.where(kept, s.cycle.origin, lie.translation(s.T))
         matrix, of_edges = _matrix(problem, s.T, origin, s.damping)
         if self.linear_solver is None:
-            inverse = control.cond(kept, lambda: inverse, lambda: multigrid(matrix))
+            inverse = control.cond(kept, lambda: inverse, lambda: near_inverse(matrix))
         # What is left of the system then would gain less than what ends the descent.
         spared = _SPARED * self.limit * s.cost
         x, rounds = _tangents(
@@ -266,7 +267,7 @@ def _best_of_ways(
 def _tangents(
     matrix: GraphLaplacian,
     force: Array,
-    solver: Multigrid | LinearSolver,
+    solver: Multigrid | Chained | LinearSolver,
     spared: Array,
 ) -> tuple[Array, Array]:
     """Left tangents x of the normal equations B' Q B x = -B' f, and the rounds.
