@@ -27,10 +27,10 @@ from jaxreg.linear.operator import GraphLaplacian
 from jaxreg.linear.small import after, product
 
 
-# Room for four ends of each closure and some gaps; worth it up to a quarter of so many
+# Room for two ends of each closure and some gaps; worth it up to a quarter of so many
 # frames at least: of fewer a cycle of the whole solves in less than a second, and
 # compiles in two thirds of the time.
-_ENDS, _GAPS, _WORTH, _LONG = 4, 64, 4, 8192
+_ENDS, _GAPS, _WORTH, _LONG = 2, 64, 4, 8192
 # What is left of the small system: the rounds outside are few then, one to eight on a
 # chain of 10,000 frames.
 _LEFT, _ROUNDS = 1e-3, 100
