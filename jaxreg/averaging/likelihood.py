@@ -18,7 +18,9 @@ in `length_scale`) has k components, k = 6 or 3.
   That is the D for the question which of several poses are right (`explained`).
 * Registration fails for views far apart and seldom for near ones. So p is one number
   for the edges to the nearest t measured neighbours of one of their ends, as the poses
-  place them, and another, no larger, for those beyond. Both, and t, are unknown.
+  place them, and another, no larger, for those beyond. Both, and t, are unknown. Of
+  graphs that are sequences, most edges steps, near may be the steps instead: a false
+  closure that no other crosses and a false step under it explain a loop equally well.
 * A prior weight w, over the middle one, multiplies the odds: p / (1 - p) w.
 * The poses are fitted to the same motions. Integrating them out (Laplace's method)
   costs each of the n - 1 that are free the factor (R / s)^D, which is what an edge that
@@ -132,8 +134,8 @@ def explained(
     log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
     prior = log_odds[:, None] + weigh[None]
     none = jax.nn.softplus(prior)
-    is_near = _among_nearest(graph, T_world_i).astype(sq.dtype)  # (t + 1, e)
-    band = jnp.diff(is_near, axis=0, prepend=0)
+    near_ways, meant = _near_ways(graph, T_world_i, alone)  # (t, e)
+    both_sides = jnp.concatenate([near_ways, ~near_ways]).astype(sq.dtype)
     allowed = log_odds[:, None] >= jnp.maximum(log_odds, 0)[None]  # near, far
     free, reach = graph.num_held - 1, _reach(graph.dim)
 
@@ -146,17 +148,16 @@ def explained(
         gain, most = log_gain(deviation)
         each = jax.nn.softplus(prior + gain[None]) - none
         each = jnp.where(graph.weight[None] > 0, each, 0)
-        part = jnp.matmul(each, band.T, precision=jax.lax.Precision.HIGHEST)
-        near = jnp.cumsum(part, axis=1)[:, :-1]
-        far = jnp.cumsum(part[:, ::-1], axis=1)[:, -2::-1]
+        sums = jnp.matmul(each, both_sides.T, precision=jax.lax.Precision.HIGHEST)
+        near, far = jnp.split(sums, 2, axis=1)
         both = near[:, None] + far[None]  # near, far, t
-        return jnp.where(allowed[..., None], both, -jnp.inf) - free * most
+        return jnp.where(allowed[..., None] & meant, both, -jnp.inf) - free * most
 
     ladder = jnp.asarray(deviations, sq.dtype)
     every = jax.lax.map(terms, ladder)
-    count = len(deviations) * len(_NEAREST) * jnp.sum(allowed)
+    count = len(deviations) * jnp.sum(meant) * jnp.sum(allowed)
     s, near, far, t = jnp.unravel_index(jnp.argmax(every), every.shape)
-    p = jnp.where(is_near[t] > 0, log_odds[near], log_odds[far])
+    p = jnp.where(near_ways[t], log_odds[near], log_odds[far])
     right = p + weigh + log_gain(ladder[s])[0]
     ratio = jax.nn.logsumexp(every) - jnp.log(count.astype(sq.dtype))
     return Explained(
@@ -217,12 +218,29 @@ def _reach(dim: int) -> float:
     return (turns * ball) ** (1 / k) / math.sqrt(2 * math.pi)
 
 
+def _near_ways(
+    graph: PoseGraph, T_world_i: Float[Array, "v D D"], alone: bool
+) -> tuple[Bool[Array, "t e"], Bool[Array, " t"]]:
+    """Whether an edge is near in each way, and which ways may be meant.
+
+    Successive numbers say what is near if most edges are the steps of a sequence.
+    """
+    near = _among_nearest(graph, T_world_i)
+    meant = jnp.ones(len(near), bool)
+    if alone:
+        return near, meant
+    present = graph.weight > 0
+    sequence = 2 * jnp.sum(graph.successive & present) > jnp.sum(present)
+    ways = jnp.concatenate([near, graph.successive[None]])
+    return ways, jnp.append(meant, sequence)
+
+
 def _among_nearest(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"]
 ) -> Bool[Array, "t e"]:
     """Whether one end of an edge is among the t nearest measured neighbours of another.
 
-    For each t of `_NEAREST`; the last row has all edges. Nearness is that of the poses:
+    For each t of `_NEAREST`. Nearness is that of the poses:
     squared angle (chordal) and squared length over `length_scale`. Edges as near as
     each other are so alike.
     """
@@ -243,5 +261,4 @@ def _among_nearest(
     bound = jnp.where(own & (last < len(frame)), ascending[there], jnp.inf)
     # Compilers compute a distance more than once, not always to the same last digit.
     bound = bound + 16 * jnp.finfo(bound.dtype).eps * (1 + bound)
-    near = jnp.any(far[None, None] <= bound[:, ends], axis=1)
-    return jnp.concatenate([near, jnp.ones_like(near[:1])])
+    return jnp.any(far[None, None] <= bound[:, ends], axis=1)

@@ -166,6 +166,11 @@ class PoseGraph(eqx.Module):
         return self.T_i_j.shape[-1] - 1
 
     @property
+    def successive(self) -> Bool[Array, " e"]:
+        """Which edges join frames of successive numbers, as the steps of a sequence."""
+        return jnp.abs(self.edges[:, 0] - self.edges[:, 1]) == 1
+
+    @property
     def length_scale(self) -> Float[Array, ""]:
         """The length that stands for one radian: the mean |t_i_j| of the middle half.
 

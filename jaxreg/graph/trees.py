@@ -177,11 +177,8 @@ def along_frames(graph: PoseGraph) -> Float[Array, "v D D"]:
     Large graphs are sequences as a rule, and a recording seldom slips between one
     frame and the next, while closures of loops may be false.
     """
-    usual = jnp.max(graph.weight)
-    successive = jnp.abs(graph.edges[:, 0] - graph.edges[:, 1]) == 1
-    weight = jnp.where(
-        (graph.weight > 0) & successive, graph.weight + usual, graph.weight
-    )
+    more = graph.weight + jnp.max(graph.weight)
+    weight = jnp.where((graph.weight > 0) & graph.successive, more, graph.weight)
     return maximum_spanning_tree(
         graph.edges, graph.T_i_j, weight, graph.num_poses
     ).T_world_i

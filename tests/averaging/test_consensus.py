@@ -1,3 +1,5 @@
+from itertools import accumulate
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -148,3 +150,26 @@ def test_wrong_motions_of_a_noisy_grid_are_found():
         assert np.mean(trusted[~bad]) > 0.85
         assert not trusted[bad].any()
         assert rotation_error(found.T_world_i, truth, "best") < 1.2 * oracle
+
+
+def test_a_false_closure_is_told_from_a_false_step_under_it():
+    num, trusted, wrong = 24, [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        step = motions(
+            rotations(rng, num - 1, 3, 0.3), np.eye(3)[np.zeros(num - 1, int)]
+        )
+        X = np.array(list(accumulate(step, np.matmul, initial=np.eye(4))))
+        ends = [sorted(rng.choice(num, 2, replace=False)) for _ in range(4)]
+        steps = np.stack([np.arange(num - 1), np.arange(1, num)], axis=1)
+        edges = np.concatenate([steps, ends])
+        noise = 0.01 * rng.normal(size=(len(edges), 3))
+        noise = motions(rotations(rng, len(edges), 3, 0.01), noise)
+        T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]] @ noise
+        false = rng.permutation(4)[:2] + num - 1
+        T[false] = motions(rotations(rng, 2, 3, None), rng.uniform(-5, 5, (2, 3)))
+        order = rng.permutation(len(edges))
+        graph = PoseGraph.from_edges(edges[order], T[order].astype(np.float32))
+        trusted.append(np.asarray(average(graph).edge_weight) > 0.5)
+        wrong.append(np.isin(order, false))
+    np.testing.assert_array_equal(~np.array(trusted), np.array(wrong))

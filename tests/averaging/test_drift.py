@@ -179,6 +179,7 @@ def test_what_edges_do_not_measure_allows_any_drift():
         np.eye(3)[None], 20 * np.random.default_rng(0).normal(size=(CLOSURES, 3))
     )
     graph = graph_of(edges, T, dtype=np.float32)
+    assert graph.information is not None
     of_turns = graph.information.at[:, :3].set(0).at[:, :, :3].set(0)
     squares, _ = squared_misclosures(graph)
     assert (np.asarray(squares)[NUM - 1 :] > 100).all()

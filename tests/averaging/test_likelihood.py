@@ -27,8 +27,8 @@ def single(edges, T, num: int, **kwargs) -> PoseGraph:
     return PoseGraph.from_edges(edges, T.astype(np.float32), num, **kwargs)
 
 
-def naive(X, edges, T, weight, dimension, deviations) -> float:
-    """Log Lambda, edge by edge in float64."""
+def naive(X, edges, T, weight, dimension, deviations, sequence=False) -> float:
+    """Log Lambda, edge by edge in float64; of a sequence near may be successive."""
     d, k = X.shape[-1] - 1, 3 * X.shape[-1] - 6
     length = np.linalg.norm(T[:, :d, d], axis=1)
     low, high = np.sort(length)[[round(q * (len(T) - 1)) for q in (0.25, 0.75)]]
@@ -51,15 +51,18 @@ def naive(X, edges, T, weight, dimension, deviations) -> float:
         3: 8 * np.pi**2 * 4 / 3 * np.pi * (4 / 3) ** 3,
     }[d]
     reach = volume ** (1 / k) / np.sqrt(2 * np.pi)
+    near_ways = [np.array(rank) < t for t in (4, 8)]
+    if sequence:
+        near_ways.append(np.abs(np.diff(edges, axis=1))[:, 0] == 1)
     odds = [-4.5, -3, -1.5, 0, 1.5, 3, 4.5]
     prior = weight / np.sort(weight)[round(0.5 * (len(weight) - 1))]
     terms = []
     for s in deviations:
         gain = (reach / s) ** dimension * np.exp(-np.array(sq) / (2 * s**2))
-        for t in (4, 8):
+        for is_near in near_ways:
             for near in odds[3:]:
                 for beyond in (x for x in odds if x <= near):
-                    o = np.exp(np.where(np.array(rank) < t, near, beyond)) * prior
+                    o = np.exp(np.where(is_near, near, beyond)) * prior
                     each = np.log((1 + o * gain) / (1 + o)).sum()
                     free = len(np.unique(edges)) - 1
                     terms.append(each - free * dimension * np.log(reach / s))
@@ -75,11 +78,27 @@ def test_against_a_sum_over_edges_and_shares(d, outliers):
     for poses in (X, random_graph(N, H, 0.0, 1, d=d)[0]):
         of = jnp.asarray(poses, jnp.float32)
         ladder = 0.5 / 2.0 ** np.arange(8)
-        expected = naive(poses, edges, T, weight, {2: 3, 3: 6}[d], ladder[1:])
+        k = {2: 3, 3: 6}[d]
+        expected = naive(poses, edges, T, weight, k, ladder[1:])
         np.testing.assert_allclose(log_evidence(graph, of), expected, rtol=2e-3)
         expected = naive(poses, edges, T, weight, 0.8, ladder)
         found = explained(graph, of)
         np.testing.assert_allclose(found.log_ratio, expected, rtol=2e-3, atol=1e-2)
+
+
+@pytest.mark.parametrize("steps", [8, 6])
+def test_steps_of_a_sequence_may_be_what_is_near(steps):
+    X, _, _, _ = random_graph(N, H, 0.0, 0)
+    first = np.arange(steps)
+    closures = [[0, 3], [2, 5], [1, 6], [0, 7], [3, 7], [2, 9], [8, 5]]
+    edges = np.concatenate([np.stack([first, first + 1], axis=1), closures])
+    rng = np.random.default_rng(0)
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]]
+    T[-3:-1] = motions(rotations(rng, 2, 3, None), rng.uniform(-1, 1, (2, 3)))
+    found = explained(single(edges, T, N), jnp.asarray(X, jnp.float32))
+    one, ladder = np.ones(len(edges)), 0.5 / 2.0 ** np.arange(8)
+    expected = naive(X, edges, T, one, 0.8, ladder, sequence=steps > len(closures))
+    np.testing.assert_allclose(found.log_ratio, expected, rtol=2e-3, atol=1e-2)
 
 
 @settings(max_examples=20, deadline=None)

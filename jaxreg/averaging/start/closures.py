@@ -32,12 +32,11 @@ def without_doubtful_closures(graph: PoseGraph) -> PoseGraph:
     closures bends a long sequence, which hardly resists, so only those stay that join
     components.
     """
-    successive = jnp.abs(graph.edges[:, 0] - graph.edges[:, 1]) == 1
-    closure = (graph.weight > 0) & ~successive
+    closure = (graph.weight > 0) & ~graph.successive
     supported = confirmed(graph, closure)
     far = drifted(graph, closure)
     usual = jnp.sum(supported & ~far) >= jnp.sum(closure & ~far) / 2
-    steps = jnp.sum((graph.weight > 0) & successive)
+    steps = jnp.sum((graph.weight > 0) & graph.successive)
     usual = usual & (steps >= (graph.num_poses - 1) / 2)
     doubted = closure & usual & ~supported | far
     little = jnp.finfo(graph.weight.dtype).eps ** 0.5
