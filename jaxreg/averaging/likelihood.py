@@ -151,7 +151,8 @@ def explained(
         sums = jnp.matmul(each, both_sides.T, precision=jax.lax.Precision.HIGHEST)
         near, far = jnp.split(sums, 2, axis=1)
         both = near[:, None] + far[None]  # near, far, t
-        return jnp.where(allowed[..., None] & meant, both, -jnp.inf) - free * most
+        may = allowed[..., None] & meant[None, None]
+        return jnp.where(may, both, -jnp.inf) - free * most
 
     ladder = jnp.asarray(deviations, sq.dtype)
     every = jax.lax.map(terms, ladder)
