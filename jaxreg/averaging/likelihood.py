@@ -47,6 +47,7 @@ from jaxreg._core.quantile import nearest_rank
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
 from jaxreg.graph.pose_graph import PoseGraph
+from jaxreg.linear.laplacian import DENSE_LIMIT
 
 
 #: Deviations of right edges, radians and length scales: octaves from where the normal
@@ -224,11 +225,13 @@ def _near_ways(
 ) -> tuple[Bool[Array, "t e"], Bool[Array, " t"]]:
     """Whether an edge is near in each way, and which ways may be meant.
 
-    Successive numbers say what is near if most edges are the steps of a sequence.
+    Successive numbers say what is near if most edges are the steps of a sequence. Of
+    more than `DENSE_LIMIT` frames drift tells false closures, and this would count it
+    against right ones: a path that nothing bends holds all its steps exactly.
     """
     near = _among_nearest(graph, T_world_i)
     meant = jnp.ones(len(near), bool)
-    if alone:
+    if alone or graph.num_poses > DENSE_LIMIT:
         return near, meant
     present = graph.weight > 0
     sequence = 2 * jnp.sum(graph.successive & present) > jnp.sum(present)
