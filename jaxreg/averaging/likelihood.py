@@ -19,8 +19,8 @@ in `length_scale`) has k components, k = 6 or 3.
 * Registration fails for views far apart and seldom for near ones. So p is one number
   for the edges to the nearest t measured neighbours of one of their ends, as the poses
   place them, and another, no larger, for those beyond. Both, and t, are unknown. Of
-  graphs that are sequences, most edges steps, near may be the steps instead: a false
-  closure that no other crosses and a false step under it explain a loop equally well.
+  short sequences, most edges steps, near may be the steps instead: a false closure
+  that no other crosses and a false step under it explain a loop equally well.
 * A prior weight w, over the middle one, multiplies the odds: p / (1 - p) w.
 * The poses are fitted to the same motions. Integrating them out (Laplace's method)
   costs each of the n - 1 that are free the factor (R / s)^D, which is what an edge that
