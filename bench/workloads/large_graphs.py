@@ -53,7 +53,7 @@ def _chain_case(num: int) -> Case:
         methods=[Method("jaxreg default", "jaxreg", text, own, on_accelerator=True)],
         trials=[()],
         judge=partial(judge, X, wrong),
-        repeats=3 if num < _SINGLE else 1,
+        repeats=3,
         long=True,
         x=num,
         x_label="poses of a chain, 1% closures, a tenth of them wrong",

@@ -62,7 +62,8 @@ def cases(options: Options) -> Iterator[Case]:
 
 def own_method(solve: Solve) -> Method:
     """`reconstruct` as it is."""
-    return Method("jaxreg reconstruct", "jaxreg", "defaults", solve)
+    name = "jaxreg reconstruct"
+    return Method(name, "jaxreg", "defaults", solve, on_accelerator=True)
 
 
 def peer_method(peer: Multiway, solve: Solve) -> Method:
