@@ -23,7 +23,7 @@ from jaxreg.app.cli.known import (
     writable,
 )
 from jaxreg.app.cli.options import Average
-from jaxreg.app.cli.runtime import Session, key_of
+from jaxreg.app.cli.runtime import Session, compile_in_a_hurry, key_of
 from jaxreg.app.folder import result_folder
 from jaxreg.app.plot import draw_graph, save_figure, write_graph_report
 from jaxreg.app.plot.chained import chained
@@ -54,6 +54,8 @@ METHODS = {
     "plain": MotionAveraging,
     "weighted": WeightedMotionAveraging,
 }
+# Motions that are averaged in less than a second: compiling takes ten.
+_QUICK = 10_000
 FILES = ("result.json", "poses.tum", "graph.g2o", "figure.png", "report.html")
 
 
@@ -78,6 +80,8 @@ def run(command: Average, session: Session) -> int:
         session.console.print(note)
     for message in {str(w.message) for w in caught}:
         session.console.print(message)
+    if graph.num_edges <= _QUICK:
+        compile_in_a_hurry()
     key = key_of(command)
     with session.progress() as progress, session.timed("run", computes=True):
         progress("averaging", 0, 1)

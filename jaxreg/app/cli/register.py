@@ -13,7 +13,7 @@ from jaxreg.app.cli import outputs
 from jaxreg.app.cli.guess import read_guess
 from jaxreg.app.cli.inputs import Scans, check_point, load_scans
 from jaxreg.app.cli.options import UNITS, Register
-from jaxreg.app.cli.runtime import Session, key_of, method_of
+from jaxreg.app.cli.runtime import Session, compile_in_a_hurry, key_of, method_of
 from jaxreg.app.plot.results import result_of
 from jaxreg.app.result import Result
 from jaxreg.io.errors import InputError
@@ -38,6 +38,8 @@ def run(command: Register, session: Session) -> int:
     dim = scans.points[0].shape[1]
     command.check_known(dim)
     check_point(command.position, dim, "--position")
+    if command.budget <= Register.budget:
+        compile_in_a_hurry()
     key, method = key_of(command), _method(command, scans)
     init = _guess(command, scans, units)
     with session.progress() as progress, session.timed("run", computes=True):

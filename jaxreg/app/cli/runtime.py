@@ -27,6 +27,7 @@ from jaxreg.io.errors import InputError
 from jaxreg.io.printable import printable
 
 
+_HURRY = "jax_disable_most_optimizations"
 _CACHE_TROUBLE = re.compile("Error (reading|writing) persistent compilation cache")
 
 
@@ -39,9 +40,24 @@ def computing(options: Options) -> Iterator[None]:
     """
     if options.device != "auto":
         _use_device(options.device)
-    # The precision ends with the block; the device is the process's.
-    with jax.enable_x64(options.precision == "float64"):
-        yield
+    before = jax.config.values[_HURRY]
+    # These end with the block; the device is the process's.
+    try:
+        with jax.enable_x64(options.precision == "float64"):
+            yield
+    finally:
+        jax.config.update(_HURRY, before)
+
+
+def compile_in_a_hurry() -> None:
+    """Optimises programs less, up to the end of the command.
+
+    For what computes for a second or less: a first call is over in two thirds to three
+    quarters of the time, later ones take some tenths of a second more. An accelerator's
+    programs are left as they are.
+    """
+    if jax.default_backend() == "cpu":
+        jax.config.update(_HURRY, True)
 
 
 def key_of(options: Options) -> jax.Array:

@@ -3,12 +3,15 @@
 import json
 import os
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import switched_on
 
 import jaxreg
 from jaxreg import Status
@@ -235,6 +238,46 @@ def test_a_scale_that_is_found_stays_in_the_motion(
     np.testing.assert_allclose(found["T_world_i"][1], T, atol=5e-6)
     merged = jaxreg.io.read_points("jaxreg-out/merged.ply")
     np.testing.assert_allclose(merged[40:], CLOUD, atol=1e-5)
+
+
+_HURRY = "jax_disable_most_optimizations"
+
+
+@pytest.mark.parametrize("budget", [1536, 4096])
+def test_what_computes_for_long_is_compiled_in_full(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, budget: int
+):
+    hurried = []
+
+    def register(source: Any, target: Any, method: Any, **rest: Any) -> Any:
+        hurried.append(jax.config.values[_HURRY])
+        return register_s1_onto_s0(source, target, method, **rest)
+
+    save_scans(folder)
+    monkeypatch.setattr(jaxreg, "register", register)
+    with switched_on(_HURRY, to=False):
+        assert main(["register", "s1.npy", "s0.npy", "--budget", str(budget)]) == 0
+        assert not jax.config.values[_HURRY]
+    assert hurried == [budget == 1536]
+
+
+@pytest.mark.parametrize("quick", [3, 1])
+def test_large_graphs_are_compiled_in_full(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, quick: int
+):
+    hurried = []
+
+    def averaged(*given: Any, **rest: Any) -> Any:
+        hurried.append(jax.config.values[_HURRY])
+        return jaxreg.average(*given, **rest)
+
+    Path("g.g2o").write_text(GRAPH)
+    command = import_module("jaxreg.app.cli.average")
+    monkeypatch.setattr(command, "average", averaged)
+    monkeypatch.setattr(command, "_QUICK", quick)
+    with switched_on(_HURRY, to=False):
+        assert main(["average", "g.g2o", "--method", "plain"]) == 0
+    assert hurried == [quick == 3]
 
 
 def test_average_lowers_the_objective(folder: Path, capsys: pytest.CaptureFixture[str]):
