@@ -4,12 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxreg import Status
 from jaxreg.averaging import average
 from jaxreg.averaging.likelihood import Explained
 from jaxreg.averaging.methods import annealed
 from jaxreg.averaging.steps.iterate import Iterated
 from jaxreg.averaging.trace import AveragingTrace, no_rows
-from tests.averaging.graphs import crooked_path
+from jaxreg.graph import PoseGraph
+from tests.averaging.graphs import crooked_path, motions, random_graph, rotations
 
 
 WIDTHS, SETTLING = annealed._SETTLING, annealed._SETTLING
@@ -58,3 +60,26 @@ def test_few_right_closures_of_a_short_path_are_trusted():
     # Five of six steps hold all but exactly: they tell little about the noise.
     graph, _ = crooked_path(0, 60, 10, 0, told=False)
     assert np.asarray(average(graph).edge_weight > 0.5).all()
+
+
+def test_translations_of_a_short_path_are_not_taken_for_exact():
+    # 29 edges hold 23 poses: turns can be a little off so that no translation is.
+    widths = []
+    for seed in range(3):
+        found = average(crooked_path(seed, 24, 6, 2, told=False)[0])
+        assert found.status == Status.CONVERGED
+        widths.append(found.kernel_width)
+    three_deviations = [3 * 0.01, 3 * 0.009]
+    ratio = np.median(widths, axis=0) / three_deviations
+    assert ((ratio > 0.5) & (ratio < 2)).all()
+
+
+def test_precise_translations_of_many_edges_stay_precise():
+    # One edge more cannot say that they are as bad as turns.
+    X, edges, _, _ = random_graph(20, 150, 0.0, 3)
+    rng = np.random.default_rng(0)
+    T = np.linalg.inv(X[edges[:, 0]]) @ X[edges[:, 1]]
+    T = T @ motions(rotations(rng, 150, 3, 0.05), 0.02 * rng.normal(size=(150, 3)))
+    graph = PoseGraph.from_edges(edges, T.astype(np.float32), 20)
+    width = average(graph).kernel_width
+    np.testing.assert_allclose(width, [3 * 0.02, 3 * 0.05], rtol=0.1)

@@ -34,6 +34,7 @@ from jaxreg.averaging.steps.kernel_width import (
     chi2_median,
     middle_variances,
     spare_factor,
+    spared_variances,
     variance_inside,
 )
 from jaxreg.averaging.steps.levenberg_marquardt import Minimum, minimise, no_cycle
@@ -244,13 +245,18 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         middle = middle_variances(self.graph, T, self._open(T) & (trust > 0.5))
         floor = 64 * jnp.finfo(middle.dtype).eps
         floor = floor * jnp.stack([self.graph.length_scale, jnp.ones_like(middle[1])])
-        return jnp.maximum(jnp.sqrt(middle * self._spare_factor(trust)), floor)
+        count, scale = self._count(trust), self.graph.length_scale
+        variance = spared_variances(self.graph, middle, count, scale)
+        return jnp.maximum(jnp.sqrt(variance), floor)
 
     def _spare_factor(self, trust: Array) -> Float[Array, ""]:
         """How much more noise there is than the poses leave, by the edges inside."""
+        return spare_factor(self.graph, self._count(trust))
+
+    def _count(self, trust: Array) -> Float[Array, ""]:
+        """How many edges are inside."""
         trust = jnp.where(self.graph.weight > 0, trust, 0)
-        count = jnp.sum(trust, dtype=self.counted.dtype)
-        return spare_factor(self.graph, count)
+        return jnp.sum(trust, dtype=self.counted.dtype)
 
 
 def _without_cycle(state: _State) -> _State:

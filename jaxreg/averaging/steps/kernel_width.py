@@ -107,9 +107,8 @@ def _three_deviations(
     inside = (graph.weight > 0) & (trust > 0.5)
     middle = middle_variances(graph, T_world_i, inside)
     count = jnp.sum(jnp.where(graph.weight > 0, trust, 0))
-    variance = jnp.maximum(variance_inside(v, width), middle) * spare_factor(
-        graph, count
-    )
+    variance = jnp.maximum(variance_inside(v, width), middle)
+    variance = spared_variances(graph, variance, count, scale)
     floor = 64 * jnp.finfo(w.dtype).eps * jnp.stack([scale, jnp.ones_like(total)])
     # In this order: the root has no derivative where the edges agree exactly.
     least = (floor / KERNEL_DEVIATIONS) ** 2
@@ -142,6 +141,31 @@ def middle_variances(
 def chi2_median(dof: int) -> float:
     """Of the chi-squared law: the middle square of noise of variance one."""
     return float(scipy.special.chdtri(dof, 0.5))
+
+
+def spared_variances(
+    graph: PoseGraph,
+    variance: Float[Array, "2"],
+    count: Float[Array, ""],
+    scale: Float[Array, ""],
+) -> Float[Array, "2"]:
+    """Of one component of the translation and of the rotation, from what poses leave.
+
+    Poses take up noise as in `spare_factor`. Translations may lose all of theirs: of
+    few edges to spare each turn can be a little off, so that no translation is. (Not
+    the other way round: shifts turn nothing.) Before any edge is seen, noise moves what
+    is `scale` away by no less than it turns it; that counts as one more edge to spare.
+
+    Args:
+        graph: gives the poses that take up noise.
+        variance: mean squares of both parts.
+        count: the sum of the trust of the edges.
+        scale: the `length_scale` of the graph.
+    """
+    shift, turn = variance * spare_factor(graph, count)
+    spare = jnp.maximum(count - (graph.num_held - 1), 0)
+    short = jnp.maximum(turn * scale**2 - shift, 0)
+    return jnp.stack([shift + short / (spare + 1), turn])
 
 
 def spare_factor(graph: PoseGraph, count: Float[Array, ""]) -> Float[Array, ""]:
