@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench import trial_plot
+from bench import start_plot, trial_plot
 from bench.records import Row
 from bench.trajectories import trajectories
 from jaxreg.app.plot.figure import new_figure
@@ -76,6 +76,8 @@ def draw(workload: str, mode: str, rows: list[Row], out: Path) -> list[Path]:
         found.append(trajectories(rows, out / f"{head}.png"))
     if workload == "devices":
         found.append(_devices(rows, out / f"{head}.png"))
+    if workload == "command_line":
+        found.append(start_plot.draw(rows, out / f"{head}.png", _COLORS))
     if workload == "filter_paper":
         found += trial_plot.draw(rows, out, head)
     return [path for path in found if path is not None]

@@ -1,10 +1,16 @@
 """What judges answers finds the errors that were put in."""
 
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bench import plots
 from bench.peers.pose_graphs import Found
+from bench.records import Key, Metric, Row
+from bench.start_plot import bar
+from bench.workloads.command_line import judge_pair
 from bench.workloads.false_closures import closures, judge, with_false_closures
 from bench.workloads.filter_data import cube, horse, horse_model
 from bench.workloads.filter_paper import judge as judge_poses
@@ -74,3 +80,25 @@ def test_errors_are_distances_and_counts_are_of_closures():
     assert values["false trusted"] == 2
     assert values["true lost"] == 3
     assert values["e_t_max"] == pytest.approx(5, rel=0.05)
+
+
+def test_a_command_is_drawn_by_the_parts_of_its_time(tmp_path: Path):
+    told = {"trace": 1.0, "load": 0.5, "run": 2.0, "write": 0.25}
+    answers = [
+        {"status": "CONVERGED", "times_s": {"read": 0.1, **told}},
+        {"status": "CONVERGED", "times_s": {"generate": 0.3, **told, "load": 1.5}},
+        {"status": "LOW_OVERLAP", "times_s": {"read": 0.2, **told, "compile": 4.0}},
+    ]
+    metrics = {m.key: m for m in judge_pair(answers).metrics}
+    assert metrics["believed"].value == pytest.approx(200 / 3)
+    assert (metrics["read"].value, metrics["load"].value) == (0.2, 0.5)
+    metrics["wall_ms"] = Metric("wall_ms", 5_000.0, "ms", "down")
+    key = Key("full", "command_line", "two scans", "jaxreg register")
+    row = Row(key, "jaxreg", "ok", metrics=metrics)
+    parts = bar(row)
+    assert sum(parts.values()) == pytest.approx(5)
+    assert (parts["import"], parts["compile"]) == (pytest.approx(1.05), 0)
+    assert plots.draw("command_line", "full", [row], tmp_path) == [
+        tmp_path / "command_line.png"
+    ]
+    assert plots.draw("command_line", "full", [], tmp_path) == []
