@@ -7,12 +7,12 @@ then are one; and so on.
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from jaxreg._core import control
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
+from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.geometry import lie
 from jaxreg.graph.joined import joined
 from jaxreg.graph.trees import components
@@ -69,7 +69,7 @@ def _grips(
         grip = jax.tree.map(lambda x: jnp.where(use, x, 0), found.grip)
         return grip.seen_from(T_world_i[i])
 
-    return lax.map(one, pairs)
+    return map_side_by_side(one, pairs, scans.num_rows)
 
 
 @kept_program

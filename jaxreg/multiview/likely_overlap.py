@@ -9,13 +9,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core import control
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
 from jaxreg.batching.padding import rounded_up
+from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.geometry import lie
 from jaxreg.matching import Match, match
 from jaxreg.multiview.choose_pairs import all_pairs, ascending, pair_keys
@@ -154,7 +154,7 @@ def _overlap(
             lambda: jnp.zeros_like(scans.coarsest),
         )
 
-    return lax.map(share, pairs)
+    return map_side_by_side(share, pairs, scans.num_rows)
 
 
 def _near(found: Match, spacing: Scalar) -> Scalar:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motions, Scalar
+from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.cloud import (
     OTHER_UNIT,
     Frames,
@@ -65,6 +66,11 @@ class PreparedScans(eqx.Module):
     def num_scans(self) -> int:
         """V."""
         return self.mean.shape[0]
+
+    @property
+    def num_rows(self) -> int:
+        """Points of a pair."""
+        return 2 * self.clouds.points.shape[1]
 
     @property
     def usable(self) -> Bool[Array, " v"]:
@@ -198,7 +204,7 @@ def prepare_scans(
     side_by_side: bool = False,
     to_search: bool = False,
 ) -> PreparedScans:
-    """Prepares all scans, one after another; NaN stands for an unknown viewpoint.
+    """Prepares all scans; NaN stands for an unknown viewpoint.
 
     Side by side their derivatives are right under `vmap`, too: in a loop JAX leaves the
     rules for them out, and what it takes instead is not a number.
@@ -219,14 +225,18 @@ def prepare_scans(
         held = len(points) <= _MOST_TABLES
         return prepare_scan(method, *scan, radius, with_table=held)
 
-    every = jax.vmap(one) if side_by_side else partial(lax.map, one)
-    clouds, tables, exact, mean, spacing, judged = every((points, mask))
+    num_rows = points.shape[1]
+    if side_by_side:
+        prepared = jax.vmap(one)((points, mask))
+    else:
+        prepared = map_side_by_side(one, (points, mask), num_rows)
+    clouds, tables, exact, mean, spacing, judged = prepared
     if viewpoints is not None:
         eyes = (viewpoints - mean) / radius
         clouds = lax.map(lambda scan: scan[0].seen_from(scan[1]), (clouds, eyes))
     if to_search and len(points) <= _MOST_TABLES:
-        common = _common_spacing(judged)
-        clouds = lax.map(lambda cloud: with_features(method, cloud, common), clouds)
+        described = partial(with_features, method, spacing=_common_spacing(judged))
+        clouds = map_side_by_side(described, clouds, num_rows)
     fault = _fault(clouds, jax.vmap(rms_radius)(points, mask) / radius, spacing)
     return PreparedScans(
         clouds, tables, exact, mean, radius, spacing, fault, dropped, positions

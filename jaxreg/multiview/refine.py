@@ -18,6 +18,7 @@ from jaxreg._core.arrays import cast_floats
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
+from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import NO_EVIDENCE, Evidence, PlaneToPlane
@@ -143,7 +144,7 @@ def _measured(
         T_i_j = control.cond(told >= least, measured, lambda _: T_i_j, pair)
         return RelativeMotions(pair, T_i_j[None], overlap[None], told[None], rmse[None])
 
-    return lax.map(one, pairs)
+    return map_side_by_side(one, pairs, scans.num_rows)
 
 
 def _told(found: Evidence) -> tuple[Scalar, Scalar, Scalar]:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxreg._core.platforms import platform_of
 from jaxreg._core.typing import Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.padding import rounded_up
@@ -36,7 +37,9 @@ from jaxreg.registrar import AbstractRegistrar
 # What a run keeps: motions of pairs as they are found, in the input's frames.
 OnPairs = Callable[[RelativeMotions], None]
 
-_PAIRS_PER_BATCH, _THREADS = 4, 2
+# Pairs of a batch: few, so that none waits for long, but an accelerator wants more.
+_ON_CPU, _ON_ACCELERATOR = 4, 32
+_THREADS = 2
 # Scans from which on pairs that cannot count are left out of a round's average: it
 # takes longer by then than the programs of more sizes take to compile.
 _LARGE = 4_000
@@ -81,6 +84,8 @@ class Rounds:
         self.sure: dict[tuple[int, int], RelativeMotions] = {}
         self.rivals: dict[tuple[int, int], RelativeMotions] = {}
         self.most = most_pairs(scans.num_scans)
+        here = platform_of(scans) == "cpu"
+        self.batch = _ON_CPU if here else _ON_ACCELERATOR
 
     def run(self, order: Order, pairs: np.ndarray | None) -> RelativeMotions:
         """All rounds; the motions, in ascending order of the scans.
@@ -129,7 +134,7 @@ class Rounds:
         self.report("registering pairs", done, total)
         found: dict[int, RelativeMotions] = {}
         for number, batch in self._searched(pairs):
-            start = number * _PAIRS_PER_BATCH
+            start = number * self.batch
             out = batch.on_host(slice(len(pairs) - start))
             rivals = [self.rivals.get(tuple(pair)) for pair in out.pairs.tolist()]
             found[number] = out.or_better(rivals)
@@ -140,8 +145,7 @@ class Rounds:
 
     def _searched(self, pairs: np.ndarray) -> Iterator[tuple[int, RelativeMotions]]:
         """Batches of pairs and their numbers as they come; the last is filled up."""
-        rows = np.arange(0, len(pairs), _PAIRS_PER_BATCH)[:, None]
-        rows = rows + np.arange(_PAIRS_PER_BATCH)
+        rows = np.arange(0, len(pairs), self.batch)[:, None] + np.arange(self.batch)
         batches = list(pairs[np.minimum(rows, len(pairs) - 1)])
         if self.workers is not None:
             yield from self.workers.registered(batches)

@@ -6,13 +6,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import ArrayLike, Key
+from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.method import num_kept, solve
 from jaxreg.multiview.prepare import PreparedScans
@@ -191,7 +191,7 @@ def relative_motions(
     pairs: Int[Array, "e 2"],
     key: Key,
 ) -> RelativeMotions:
-    """Registers scan j to scan i for each pair (i, j), one pair after another.
+    """Registers scan j to scan i for each pair (i, j).
 
     In the scans' centred frames. The random numbers of a pair depend on its ids alone,
     not on the number of scans nor on its place in the batch, so any division of the
@@ -220,4 +220,4 @@ def relative_motions(
             jnp.where(sound, modes.inlier_rmse, 0),
         )
 
-    return lax.map(one, pairs)
+    return map_side_by_side(one, pairs, scans.num_rows)
