@@ -1,14 +1,12 @@
 """Where the time of a command goes, compiling and with kept programs."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from bench.records import Row
-from jaxreg.app.plot.figure import new_figure
-from jaxreg.io.atomic import atomic_write
+from jaxreg.app.plot.figure import new_figure, save_figure
 
 
 #: What a command reports of its time, in order; the rest are imports, mostly.
@@ -38,10 +36,7 @@ def draw(rows: list[Row], path: Path, colors: Sequence[str]) -> Path | None:
     axis.grid(axis="x", alpha=0.3)
     axis.set_xlabel("wall time, s", fontsize=9)
     figure.legend(loc="outside right center", fontsize=8, frameon=False)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    with atomic_write(path, "wb") as file:
-        file.write(buffer.getvalue())
+    save_figure(path, figure)
     return path
 
 
