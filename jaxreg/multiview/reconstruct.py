@@ -216,7 +216,8 @@ def _of_chosen_pairs(
     prepared = prepare_scans(method, *inputs, to_search=order == "any")
     prepared = jax.block_until_ready(prepared)
     report("preparing scans", 1, 1)
-    before, first = _known(previous, prepared, order)
+    words = words_of(prepared)
+    before, first = _known(previous, prepared, order, words)
     hold = None
     if hold_previous and isinstance(previous, ReconstructionSolution):
         hold = Held.of(previous, prepared.num_scans)
@@ -227,7 +228,7 @@ def _of_chosen_pairs(
         held = None if hold is None else np.asarray(hold.held)
         told = before, on_pairs, report, workers, held
         rounds = Rounds(method, averaging, prepared, key, *told)
-        motions = rounds.run(order, first)
+        motions = rounds.run(order, first, words)
     report("averaging and refining", 0, 1)
     motions_padded = motions.padded(rounds.most)
     told = hold, known, rounds.overlaps
@@ -256,6 +257,7 @@ def _known(
     previous: object,
     scans: PreparedScans,
     order: Order,
+    words: np.ndarray | None,
 ) -> tuple[RelativeMotions | None, np.ndarray | None]:
     """Motions in the centred frames, and the pairs to begin with, None for the usual.
 
@@ -282,7 +284,7 @@ def _known(
     first = None
     if earlier is not None:
         rng = np.random.default_rng(num_old)
-        new = first_pairs(scans.num_scans, order, rng, words_of(scans))
+        new = first_pairs(scans.num_scans, order, rng, words)
         first = np.concatenate([motions.pairs, new[new[:, 1] >= num_old]])
         first = np.unique(first, axis=0)
     return motions.heard(scans), first

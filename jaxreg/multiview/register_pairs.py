@@ -29,7 +29,6 @@ from jaxreg.multiview.method import min_log_evidence, num_kept
 from jaxreg.multiview.place import Placement, joins, likely, place
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
-from jaxreg.multiview.similar_scans import words_of
 from jaxreg.multiview.workers import Workers
 from jaxreg.registrar import AbstractRegistrar
 
@@ -87,16 +86,18 @@ class Rounds:
         here = platform_of(scans) == "cpu"
         self.batch = _ON_CPU if here else _ON_ACCELERATOR
 
-    def run(self, order: Order, pairs: np.ndarray | None) -> RelativeMotions:
+    def run(
+        self, order: Order, pairs: np.ndarray | None, words: np.ndarray | None
+    ) -> RelativeMotions:
         """All rounds; the motions, in ascending order of the scans.
 
         Args:
             order: of the scans, see `first_pairs`.
             pairs: of the first round, or None.
+            words: which scans look alike, or None (`words_of`).
         """
         bits = np.asarray(jax.random.key_data(self.key)).ravel()
         rng = np.random.default_rng(bits)
-        words = words_of(self.scans)
         if pairs is None:
             pairs = first_pairs(self.scans.num_scans, order, rng, words)
             if order == "sequential":

@@ -5,7 +5,6 @@
 """
 
 import functools
-import hashlib
 import pickle
 import sys
 import tempfile
@@ -67,11 +66,10 @@ class Workers:
     ) -> None:
         self._executor = executor
         host = jax.tree.map(np.asarray, (method, scans, jax.random.key_data(key)))
-        content = pickle.dumps((*host, str(jax.random.key_impl(key))), protocol=5)
         self._folder = tempfile.TemporaryDirectory(prefix="jaxreg-scans-")
-        name = hashlib.sha256(content).hexdigest()
-        self._shared = Path(self._folder.name) / f"{name}.pickle"
-        self._shared.write_bytes(content)
+        self._shared = Path(self._folder.name) / "scans.pickle"
+        with self._shared.open("wb") as file:
+            pickle.dump((*host, str(jax.random.key_impl(key))), file, protocol=5)
 
     def __enter__(self) -> "Workers":
         return self
