@@ -10,6 +10,7 @@ import contextlib
 import difflib
 import gc
 import io
+import itertools
 import os
 import shlex
 import signal
@@ -136,6 +137,7 @@ def _run(arguments: list[str]) -> int:
     _require_command(
         arguments[0], [get_args(x)[0].__name__.lower() for x in get_args(COMMANDS)]
     )
+    _require_two_scans(arguments)
     command = tyro.cli(
         COMMANDS,
         prog="jaxreg",
@@ -172,3 +174,13 @@ def _require_command(word: str, commands: list[str]) -> None:
     raise InputError(
         f"{word}: no such command.{meant}\nCommands: {', '.join(commands)}."
     )
+
+
+def _require_two_scans(arguments: list[str]) -> None:
+    """Refuses more of them to `register`, and names who takes many."""
+    scans = list(itertools.takewhile(lambda x: not x.startswith("-"), arguments[1:]))
+    if arguments[0] == "register" and len(scans) > 2:
+        raise InputError(
+            f"register: wanted two scans, found {len(scans)}.\n"
+            "Many scans go to: jaxreg multiview"
+        )

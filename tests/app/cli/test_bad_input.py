@@ -57,6 +57,7 @@ def _bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "bad seed": ([m, *pair, "--seed", "-1"], "--seed -1"),
         "truth missing": ([m, *pair, "--truth", "none.conf"], "none.conf"),
         "truth of others": ([m, *pair, "--truth", "other.conf"], "other.conf"),
+        "three to register": ([r, *pair, "s2.npy"], "go to: jaxreg multiview"),
         "register missing": ([r, "s0.npy", "none.ply"], "none.ply"),
         "register many": ([r, "three.npz", "s0.npy"], "three.npz"),
         "graph missing": ([a, "none.g2o"], "none.g2o"),
