@@ -1,11 +1,10 @@
 """Pairs of scans registered by the processes of an executor.
 
 `concurrent.futures` hands out the tasks, as do engines that follow it (Dask's
-`Client.get_executor()`). Prepared scans lie in a file that every process reads once.
+`Client.get_executor()`). Prepared scans lie in a file that every process maps.
 """
 
 import functools
-import pickle
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,6 +20,7 @@ import numpy as np
 
 from jaxreg._core.cache import cache
 from jaxreg._core.typing import Key
+from jaxreg.multiview.mapped_file import read_tree, write_tree
 from jaxreg.multiview.prepare import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
 from jaxreg.registrar import AbstractRegistrar
@@ -44,6 +44,7 @@ class _Task(NamedTuple):
 
     pairs: np.ndarray
     shared: Path  # the method, the scans and the key
+    kind_of_key: str
     programs: str | None  # folder of compiled ones
     x64: bool
     versions: tuple[str, ...]
@@ -66,10 +67,13 @@ class Workers:
     ) -> None:
         self._executor = executor
         host = jax.tree.map(np.asarray, (method, scans, jax.random.key_data(key)))
-        self._folder = tempfile.TemporaryDirectory(prefix="jaxreg-scans-")
-        self._shared = Path(self._folder.name) / "scans.pickle"
-        with self._shared.open("wb") as file:
-            pickle.dump((*host, str(jax.random.key_impl(key))), file, protocol=5)
+        # Where a mapped file cannot be removed it stays behind.
+        self._folder = tempfile.TemporaryDirectory(
+            prefix="jaxreg-scans-", ignore_cleanup_errors=True
+        )
+        self._shared = Path(self._folder.name) / "scans"
+        write_tree(self._shared, host)
+        self._kind_of_key = str(jax.random.key_impl(key))
 
     def __enter__(self) -> "Workers":
         return self
@@ -113,6 +117,7 @@ class Workers:
         return _Task(
             pairs,
             self._shared,
+            self._kind_of_key,
             config.jax_compilation_cache_dir,
             jnp.result_type(float) == jnp.float64,
             _versions(),
@@ -148,7 +153,7 @@ def _registered(task: _Task) -> RelativeMotions:
         cache(task.programs)
     with jax.enable_x64(task.x64):
         try:
-            method, scans, key = _shared(task.shared)
+            method, scans, key = _shared(task.shared, task.kind_of_key)
         except FileNotFoundError as err:
             raise WorkerError(
                 f"A worker does not see {task.shared}: let TMPDIR of the caller name a "
@@ -160,7 +165,8 @@ def _registered(task: _Task) -> RelativeMotions:
 
 
 @functools.lru_cache(maxsize=1)
-def _shared(path: Path) -> tuple[AbstractRegistrar, PreparedScans, Key]:
-    method, scans, bits, impl = pickle.loads(path.read_bytes())
-    arrays = jax.tree.map(jnp.asarray, (method, scans))
-    return *arrays, jax.random.wrap_key_data(jnp.asarray(bits), impl=impl)
+def _shared(
+    path: Path, kind_of_key: str
+) -> tuple[AbstractRegistrar, PreparedScans, Key]:
+    method, scans, bits = read_tree(path)
+    return method, scans, jax.random.wrap_key_data(bits, impl=kind_of_key)
