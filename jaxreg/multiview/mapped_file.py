@@ -44,4 +44,4 @@ def read_tree(path: Path) -> Any:
         start += -start % _ALIGNED
         arrays.append(whole[start : start + size])
         start += size
-    return jax.device_put(pickle.loads(rest, buffers=arrays), may_alias=True)
+    return jax.device_put(pickle.loads(rest, buffers=arrays))
