@@ -20,7 +20,7 @@ from jaxreg.multiview.method import min_log_evidence
 from jaxreg.multiview.near_pairs import near_pairs
 from jaxreg.multiview.pair_trust import pair_trust
 from jaxreg.multiview.place import Placement, agreeing, place, prior_weight
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import refine
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution

@@ -23,7 +23,8 @@ from jaxreg.local.covariance import answer, inverse_within
 from jaxreg.matching.problem import match
 from jaxreg.multiview.check_scans import padded_scans
 from jaxreg.multiview.far_scans import FarScans
-from jaxreg.multiview.prepare import PreparedScans, prepare_scans
+from jaxreg.multiview.prepare import prepare_scans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import WIDTH_END, optimiser_of
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.particle import ParticleFilter

@@ -20,7 +20,7 @@ from jaxreg.matching import Grip
 from jaxreg.multiview.in_blocks import in_blocks
 from jaxreg.multiview.parts import in_main_body
 from jaxreg.multiview.place import Placement
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 
 
 def slipping(

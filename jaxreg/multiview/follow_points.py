@@ -14,7 +14,7 @@ from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.local import LocalOptimiser, Rest, at_rest
 from jaxreg.matching import Problem
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.neighbours import exact_index
 

@@ -16,7 +16,7 @@ from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import NO_EVIDENCE, PlaneToPlane
 from jaxreg.multiview.method import follower, log_prior
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.registrar import AbstractRegistrar
 

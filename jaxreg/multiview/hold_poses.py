@@ -18,7 +18,7 @@ from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.place import Placement, place
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import measured, wide_unless_given
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution

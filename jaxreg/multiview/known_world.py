@@ -27,7 +27,7 @@ from jaxreg.graph import PoseGraph
 from jaxreg.linear.small import product
 from jaxreg.multiview.pair_trust import pair_trust
 from jaxreg.multiview.place import Placement, joins, prior_weight
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution
 

@@ -21,7 +21,7 @@ from jaxreg.matching import Match, match
 from jaxreg.multiview.choose_pairs import all_pairs, ascending, pair_keys
 from jaxreg.multiview.in_blocks import in_blocks
 from jaxreg.multiview.place import Placement
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 
 
 # Poses of a chain drift: points this many spacings apart, one spacing over or under the

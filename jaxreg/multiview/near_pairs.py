@@ -13,7 +13,7 @@ from jaxreg.graph.joined import joined
 from jaxreg.multiview.choose_pairs import ALL_UP_TO, LIKELY
 from jaxreg.multiview.likely_overlap import LikelyOverlap, NearPairs, likely_overlap
 from jaxreg.multiview.place import Placement, joins
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 
 

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from jaxreg.geometry import lie
 from jaxreg.multiview.place import Placement, displacement
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 
 

@@ -35,7 +35,8 @@ from jaxreg.multiview.far_scans import FarScans
 from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.known_world import KnownWorld
 from jaxreg.multiview.positions import ScanPositions
-from jaxreg.multiview.prepare import PreparedScans, prepare_scans
+from jaxreg.multiview.prepare import prepare_scans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.register_pairs import OnPairs, Rounds
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
 from jaxreg.multiview.similar_scans import words_of

@@ -26,7 +26,7 @@ from jaxreg.multiview.follow_points import follow_points
 from jaxreg.multiview.in_blocks import in_blocks
 from jaxreg.multiview.parts import first_where, in_main_body, part_sizes
 from jaxreg.multiview.place import Placement, place
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.robust import GemanMcClure
 

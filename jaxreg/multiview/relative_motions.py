@@ -15,7 +15,7 @@ from jaxreg._core.typing import ArrayLike, Key
 from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.method import num_kept, solve
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.registrar import AbstractRegistrar
 
 

@@ -13,7 +13,7 @@ of counts).
 
 import numpy as np
 
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 
 
 # More told a little more, fewer a little less: 128, 256 and 512 were tried.

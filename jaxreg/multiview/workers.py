@@ -21,7 +21,7 @@ import numpy as np
 from jaxreg._core.cache import cache
 from jaxreg._core.typing import Key
 from jaxreg.multiview.mapped_file import read_tree, write_tree
-from jaxreg.multiview.prepare import PreparedScans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
 from jaxreg.registrar import AbstractRegistrar
 

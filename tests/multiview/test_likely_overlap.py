@@ -10,7 +10,8 @@ from jaxreg.multiview import likely_overlap
 from jaxreg.multiview.likely_overlap import LikelyOverlap
 from jaxreg.multiview.near_pairs import near_pairs
 from jaxreg.multiview.place import Placement
-from jaxreg.multiview.prepare import PreparedScans, prepare_scans
+from jaxreg.multiview.prepare import prepare_scans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 
 

@@ -7,7 +7,8 @@ import pytest
 
 import jaxreg as jr
 from jaxreg.features import features_of
-from jaxreg.multiview.prepare import PreparedScans, prepare_scans
+from jaxreg.multiview.prepare import prepare_scans
+from jaxreg.multiview.prepared_scans import PreparedScans
 
 
 NUM = 400

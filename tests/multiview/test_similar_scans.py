@@ -9,7 +9,8 @@ from scipy.spatial import KDTree
 
 from jaxreg import ParticleFilter
 from jaxreg.datasets import sculpture_scans
-from jaxreg.multiview.prepare import PreparedScans, prepare_scans
+from jaxreg.multiview.prepare import prepare_scans
+from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.similar_scans import most_alike, words_of
 
 
