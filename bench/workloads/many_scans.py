@@ -20,7 +20,7 @@ from bench.case import Case, Judged, Method, Options
 from bench.records import Metric, error
 from bench.workloads.averaging_data import motions
 from jaxreg import ParticleFilter, reconstruct
-from jaxreg.cloud import centroid
+from jaxreg.cloud import centroid, rms_radius
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.metrics import rotation_errors, translation_errors
 from jaxreg.multiview import RelativeMotions
@@ -153,7 +153,7 @@ class Replayed(Executor):
     ) -> None:
         points = jnp.asarray(scans)
         mask = jnp.ones(points.shape[:2], bool)
-        radius = float(common_radius(points, mask))
+        radius = float(common_radius(jax.vmap(rms_radius)(points, mask)))
         mean = np.asarray(jax.vmap(centroid)(points, mask), np.float64)
         self._T = T_world_i.copy()
         self._T[:, :3, 3] += np.einsum("nab,nb->na", T_world_i[:, :3, :3], mean)

@@ -6,6 +6,8 @@ exactly is the world, seen from elsewhere: its edges become edges of the world, 
 no weight, however large, has to stand for exactness.
 """
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -32,6 +34,15 @@ class KnownPoses(eqx.Module):
     information: Float[Array, "p k k"] | None
     fixed: Bool[Array, " v"]
     T_world_fixed: Float[Array, "v D D"]
+
+    def padded(self, num: int) -> "KnownPoses":
+        """Of a graph of so many frames, the last of which are not known."""
+        more = num - len(self.fixed)
+        T = jnp.pad(self.T_world_fixed, ((0, more), (0, 0), (0, 0)))
+        fixed = jnp.pad(self.fixed, (0, more))
+        eye = jnp.eye(T.shape[-1], dtype=T.dtype)
+        T = jnp.where(fixed[:, None, None], T, eye)
+        return replace(self, fixed=fixed, T_world_fixed=T)
 
 
 def anchored(graph: PoseGraph, known: KnownPoses) -> PoseGraph:

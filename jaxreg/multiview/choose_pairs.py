@@ -14,7 +14,9 @@ pairs.
 
 from typing import Literal
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -53,10 +55,11 @@ def most_pairs(num_scans: int) -> int:
     return every if num_scans <= ALL_UP_TO else min(every, _PAIRS_PER_SCAN * num_scans)
 
 
-def most_tries(num_scans: int) -> int:
+def most_tries(num_scans: Int[Array, ""] | int) -> Int[Array, ""]:
     """Pairs of one scan, at most, of many scans on average."""
-    every = max(num_scans - 1, 1)
-    return every if num_scans <= ALL_UP_TO else min(every, 2 * _PAIRS_PER_SCAN)
+    every = jnp.maximum(num_scans - 1, 1)
+    few = num_scans <= ALL_UP_TO
+    return jnp.where(few, every, jnp.minimum(every, 2 * _PAIRS_PER_SCAN))
 
 
 def all_pairs(num_scans: int) -> np.ndarray:

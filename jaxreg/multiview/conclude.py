@@ -53,7 +53,7 @@ def finish(
     """
     moving, scans = scans, lax.stop_gradient(scans)
     least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
-    placement = place(motions, scans.num_scans, averaging, least)
+    placement = place(motions, scans.num_scans, averaging, least, scans.count)
     mode, turns = placement.mode, turnable(motions, placement)
     pairs = near_pairs(scans, placement, motions, overlaps)
     likely = least - _VOUCHED
@@ -102,7 +102,8 @@ def _solution(
     scan_status = jnp.where(placement.misfit, Status.NO_AGREEMENT, scan_status)
     scan_status = jnp.where(scans.usable, scan_status, scans.fault)
     status = jnp.where(jnp.any(free & placed), Status.AMBIGUOUS, found_status)
-    status = jnp.where(jnp.all(placed), status, Status.DISCONNECTED)
+    every = jnp.all(placed | ~scans.present)
+    status = jnp.where(every, status, Status.DISCONNECTED)
     unheld = placement.status == Status.DEGENERATE
     status = jnp.where(unheld, Status.DEGENERATE, status)
     trace = placement.trace

@@ -23,7 +23,7 @@ from jaxreg.local.covariance import answer, inverse_within
 from jaxreg.matching.problem import match
 from jaxreg.multiview.check_scans import padded_scans
 from jaxreg.multiview.far_scans import FarScans
-from jaxreg.multiview.prepare import prepare_scans
+from jaxreg.multiview.prepare_in_blocks import prepare_in_blocks
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import WIDTH_END, optimiser_of
 from jaxreg.multiview.solution import ReconstructionSolution
@@ -80,16 +80,17 @@ def scan_covariances(
         raise ValueError(
             f"relative_to: wanted a scan below {len(points)}, found {relative_to}."
         )
-    prepared = lax.stop_gradient(prepare_scans(ParticleFilter(), points, row_mask))
-    T = np.asarray(moved.T_world_i, np.float64)
+    prepared = prepare_in_blocks(ParticleFilter(), points, row_mask)
+    T = np.tile(np.eye(points.shape[-1] + 1), (prepared.num_scans, 1, 1))
+    T[: len(points)] = np.asarray(moved.T_world_i, np.float64)
     T = jnp.asarray(np.linalg.inv(T[relative_to]) @ T, points.dtype)
     edges, weight = _trusted(moved, relative_to)
-    held = np.zeros(len(points), bool)
+    held = np.zeros(len(T), bool)
     held[edges[weight > 0].ravel()] = True
     first, told = jnp.asarray(relative_to), (jnp.asarray(edges), jnp.asarray(weight))
     out = _covariances(prepared, T, first, *cast_floats(told, points.dtype))
     out = jnp.where(jnp.asarray(held)[:, None, None], out, jnp.nan)
-    return out.at[relative_to].set(0)
+    return out.at[relative_to].set(0)[: len(points)]
 
 
 def _trusted(

@@ -36,7 +36,10 @@ def descended(
     pairs: Int[Array, "e 2"],
     T_i_j: Float[Array, "e D D"],
 ) -> RelativeMotions:
-    """Motions by descents from guesses, in the scans' centred frames, m = 1."""
+    """Motions by descents from guesses, in the scans' centred frames, m = 1.
+
+    Pairs by the rows of the scans.
+    """
     dtype = T_i_j.dtype
     coarse, widest = follower(method)
     fine = LocalOptimiser(PlaneToPlane(0.01), coarse.kernel, GaussNewton())
@@ -53,7 +56,7 @@ def descended(
         T = fine.repeat(problem, T, jnp.full(_POLISH, 0.5 * spacing, dtype))
         sound = scans.usable[i] & scans.usable[j] & jnp.all(jnp.isfinite(T))
         return RelativeMotions(
-            row[0],
+            scans.ids[row[0]],
             jnp.where(sound, lie.straightened(T), jnp.eye(len(T), dtype=dtype))[None],
             jnp.where(sound, evidence.overlap, 0)[None],
             jnp.where(sound, told, NO_EVIDENCE)[None],
@@ -70,7 +73,7 @@ def descended_in_input_frames(
     T_i_j: np.ndarray,
 ) -> RelativeMotions:
     """One pair, by a descent from a guess in the input's frames and unit."""
-    pairs = jnp.array([pair], jnp.int32)
+    some, rows = scans.of_pairs(np.array([pair], np.int32))
     guess = jnp.asarray(T_i_j, scans.mean.dtype)[None]
-    guess = scans.to_centred_frames(guess, pairs[:, 0], pairs[:, 1])
-    return descended(method, scans, pairs, guess)
+    guess = some.to_centred_frames(guess, rows[:, 0], rows[:, 1])
+    return descended(method, some, rows, guess)

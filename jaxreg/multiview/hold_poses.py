@@ -18,6 +18,7 @@ from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.place import Placement, place
+from jaxreg.multiview.prepare_in_blocks import rows_for
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import measured, wide_unless_given
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -31,7 +32,8 @@ class Held(eqx.Module):
         T_world_i: `(v, d+1, d+1)` in the input's frames and unit, the identity for the
             others.
         held: `(v,)` which scans stay.
-        node: `(v,)` int32, 0 for these, and a number for each other scan.
+        node: `(v,)` int32, 0 for these, and a number for each other scan; one more for
+            the padding.
     """
 
     T_world_i: Float[Array, "v D D"]
@@ -39,15 +41,17 @@ class Held(eqx.Module):
     node: Int[Array, " v"]
 
     @classmethod
-    def of(cls, previous: ReconstructionSolution, num_scans: int) -> "Held":
+    def of(cls, previous: ReconstructionSolution, scans: PreparedScans) -> "Held":
         """The placed scans of an earlier solution of the first of these scans."""
-        more = num_scans - previous.num_scans
+        more = scans.num_scans - previous.num_scans
         held = np.pad(np.asarray(previous.placed), (0, more))
         T = np.asarray(previous.T_world_i)
         T = np.concatenate(
             [T, np.tile(np.eye(T.shape[-1], dtype=T.dtype), (more, 1, 1))]
         )
-        node = np.where(held, 0, np.cumsum(~held)).astype(np.int32)
+        others = np.cumsum(~held & np.asarray(scans.present))
+        node = np.where(np.asarray(scans.present), others, np.max(others) + 1)
+        node = np.where(held, 0, node).astype(np.int32)
         return cls(jnp.asarray(T), jnp.asarray(held), jnp.asarray(node))
 
     def of_new(self, pairs: Int[Array, "p 2"]) -> Int[Array, "q 2"]:
@@ -75,11 +79,12 @@ class Held(eqx.Module):
             pairs: those that may overlap (`near_pairs`), of scans that do not stay.
         """
         averaging, placed = wide_unless_given(averaging), _brought(self, scans, found)
-        num_nodes = 1 + int(np.max(np.asarray(self.node)))
+        count = jnp.max(jnp.where(scans.present, self.node, 0)) + 1
+        num_nodes = rows_for(2 + int(np.max(np.asarray(self.node))))
         for exact in (False, True):
             motions = measured(scans, placed, least, pairs, exact=exact)
             motions = _contracted(self, placed, motions)
-            nodes = place(motions, num_nodes, averaging, least)
+            nodes = place(motions, num_nodes, averaging, least, count)
             placed = _expanded(self, placed, nodes)
         return placed
 

@@ -65,6 +65,11 @@ class KnownWorld(eqx.Module):
         """Which scans are."""
         return self.known.poses.fixed
 
+    def padded(self, num: int) -> "KnownWorld":
+        """Of so many scans; nothing is known of those that are padding."""
+        poses = self.known.poses.padded(num)
+        return KnownWorld(dataclasses.replace(self.known, poses=poses))
+
     def place(
         self,
         scans: PreparedScans,

@@ -70,7 +70,7 @@ class LikelyOverlap:
 
     def __init__(self, scans: PreparedScans, held: np.ndarray | None = None) -> None:
         self._scans = scans
-        self._held = np.zeros(scans.num_scans, bool) if held is None else held
+        self._held = np.zeros(scans.num_present, bool) if held is None else held
         self._keys = np.zeros(0, np.int64)
         D = scans.mean.shape[1] + 1
         self._T_i_j, self._overlap = np.zeros((0, D, D)), np.zeros(0)
@@ -82,12 +82,12 @@ class LikelyOverlap:
             placement: the poses.
             seed: of the pairs that are drawn, where the scans are many.
         """
-        scans, num = self._scans, self._scans.num_scans
-        T, part = np.asarray(placement.T_world_i), np.asarray(placement.part)
+        scans, num = self._scans, self._scans.num_present
+        T, part = np.asarray(placement.T_world_i), np.asarray(placement.part)[:num]
         if num <= _ALL_UP_TO:
             pairs = all_pairs(num)
         else:
-            cells = np.asarray(_cells(scans, placement.T_world_i))
+            cells = np.asarray(_cells(scans, placement.T_world_i))[:num]
             rng = np.random.default_rng(seed)
             drawn = _sharing_cells(cells, part, np.flatnonzero(~self._held), rng)
             known = self._keys[self._overlap > 0]

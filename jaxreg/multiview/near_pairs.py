@@ -6,11 +6,12 @@ a number that grows with the scans and not with their square.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.programs import kept_program
 from jaxreg.graph.joined import joined
-from jaxreg.multiview.choose_pairs import ALL_UP_TO, LIKELY
+from jaxreg.multiview.choose_pairs import ALL_UP_TO, LIKELY, all_pairs
 from jaxreg.multiview.likely_overlap import LikelyOverlap, NearPairs, likely_overlap
 from jaxreg.multiview.place import Placement, joins
 from jaxreg.multiview.prepared_scans import PreparedScans
@@ -36,12 +37,17 @@ def near_pairs(
         motions: those that were averaged.
         likely: what is known of overlaps; None under `jit`.
     """
-    if likely is not None and scans.num_scans > ALL_UP_TO:
-        return _chosen(likely.of(placement).padded(), placement, motions.pairs)
-    every = jnp.stack(jnp.triu_indices(scans.num_scans, 1), axis=1)
+    every = all_pairs(scans.num_scans)
+    if likely is not None:
+        if scans.num_present > ALL_UP_TO:
+            return _chosen(likely.of(placement).padded(), placement, motions.pairs)
+        there = all_pairs(scans.num_present)
+        padding = np.zeros((len(every) - len(there), 2), np.int32)
+        return jax.device_put(np.concatenate([there, padding]))
+    pairs = jnp.asarray(every)
     if scans.num_scans <= ALL_UP_TO:
-        return every
-    near = NearPairs(every, likely_overlap(scans, placement, every))
+        return pairs
+    near = NearPairs(pairs, likely_overlap(scans, placement, pairs))
     return _chosen(near, placement, motions.pairs)
 
 

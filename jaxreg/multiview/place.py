@@ -1,6 +1,5 @@
 """From relative motions to poses: which pairs to trust, and which scans they place."""
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -88,6 +87,7 @@ def place(
     num_scans: int,
     averaging: AbstractAverager | None,
     least: Scalar,
+    count: Int[Array, ""] | None = None,
 ) -> Placement:
     """Averages the pairs that are likely; the world is the frame of the root.
 
@@ -107,15 +107,24 @@ def place(
     of `most_tries(v)`: each scan is tried against as many others, so the rate of false
     alarms of one trial is divided by them. Others join parts that a second pair, or a
     loop of three parts, confirms.
+
+    Args:
+        motions: of pairs.
+        num_scans: with those that are padding.
+        averaging: None for `Correntropy`.
+        least: log evidence of the pairs that count.
+        count: how many scans there are, None for all.
     """
+    num_tries = most_tries(num_scans if count is None else count)
+    strong = least + jnp.log(num_tries.astype(least.dtype))
     best = jnp.zeros(len(motions.pairs), jnp.int32)
     alike = jnp.full(len(best), _is_symmetric(motions, least))
     if motions.num_modes == 1:
-        return _averaged(motions, best, alike, num_scans, averaging, least)
+        return _averaged(motions, best, alike, num_scans, averaging, (least, strong))
 
     def again(state: _Pass) -> _Pass:
         found = _averaged(
-            motions, state.mode, state.agrees, num_scans, averaging, least
+            motions, state.mode, state.agrees, num_scans, averaging, (least, strong)
         )
         mode, agrees = agreeing(motions, found, least)
         differs = jnp.any((mode != state.mode) | (agrees != state.agrees))
@@ -149,9 +158,14 @@ def _averaged(
     agrees: Bool[Array, " e"],
     num_scans: int,
     averaging: AbstractAverager | None,
-    least: Scalar,
+    told: tuple[Scalar, Scalar],
 ) -> Placement:
-    """By one mode of each pair, which others rival unless it agrees with poses."""
+    """By one mode of each pair, which others rival unless it agrees with poses.
+
+    `told` is the log evidence of the pairs that count, and of those that join scans on
+    their own.
+    """
+    least, strong = told
     pairs, one = motions.pairs, motions.of_modes(mode, agrees)
     T_i_j, log_evidence = one.T_i_j[:, 0], one.log_evidence[:, 0]
     trusted = prior_weight(one, least)
@@ -171,8 +185,7 @@ def _averaged(
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
     agreed = jnp.where(joins(edge_weight), trusted, 0)
     agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
-    strong = log_evidence >= least + math.log(most_tries(num_scans))
-    part = confirmed_parts(pairs, agreed, num_scans, strong)
+    part = confirmed_parts(pairs, agreed, num_scans, log_evidence >= strong)
     return Placement(
         T_world_i=solution.T_world_i[swap],
         part=part,

@@ -1,9 +1,11 @@
 """`ScanPositions`: about where scanners stood, as satellite fixes tell."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -87,6 +89,21 @@ class ScanPositions(BriefModule):
                 "positions: wanted a search such as ParticleFilter(), without a prior "
                 f"or with PartialPose(up=...), found {type(prior).__name__}."
             )
+
+    def padded(self, num: int) -> "ScanPositions":
+        """With places of no consequence, for so many scans."""
+        return self._with(lambda x: jnp.pad(x, ((0, num - len(x)), (0, 0))))
+
+    def some(self, rows: Int[Array, " r"]) -> "ScanPositions":
+        """Those of some scans."""
+        return self._with(lambda x: x[rows])
+
+    def _with(self, of: Callable[[Array], Array]) -> "ScanPositions":
+        """Other rows; not by the constructor, which takes the mean of places off."""
+        rows = jax.tree.map(of, (self.position, self.antenna))
+        return eqx.tree_at(
+            lambda p: (p.position, p.antenna), self, rows, is_leaf=lambda x: x is None
+        )
 
     def of_pair(
         self, method: AbstractRegistrar, i: Int[Array, ""], j: Int[Array, ""]

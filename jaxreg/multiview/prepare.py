@@ -1,16 +1,15 @@
 """Scans made ready for pairs, once each: cleaned, centred, scaled, thinned, indexed."""
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Scalar
-from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.cloud import (
     OTHER_UNIT,
     Frames,
@@ -32,8 +31,8 @@ _MOST_TABLES = 512
 
 
 def clean(
-    points: Float[Array, "v n d"], mask: Bool[Array, "v n"]
-) -> tuple[Float[Array, "v n d"], Bool[Array, "v n"], Int[Array, " v"]]:
+    points: Float[Array, "*v n d"], mask: Bool[Array, "*v n"]
+) -> tuple[Float[Array, "*v n d"], Bool[Array, "*v n"], Int[Array, "*v"]]:
     """Masks and counts rows that are not finite."""
     finite = jnp.all(jnp.isfinite(points), axis=-1)
     dropped = jnp.sum(mask & ~finite, axis=-1).astype(jnp.int32)
@@ -41,24 +40,40 @@ def clean(
     return jnp.where(mask[..., None], points, 0), mask, dropped
 
 
-def common_radius(points: Float[Array, "v n d"], mask: Bool[Array, "v n"]) -> Scalar:
+def common_radius(radius: Float[Array, " v"]) -> Scalar:
     """The median radius of the scans that have points; 1 if none has an extent."""
-    radius = jax.vmap(rms_radius)(points, mask)
     radius = jnp.nanmedian(jnp.where(radius > 0, radius, jnp.nan))
     return jnp.where(jnp.isfinite(radius), radius, 1)
+
+
+class PreparedScan(NamedTuple):
+    """One scan, or several with a leading axis; see `PreparedScans`.
+
+    Attributes:
+        within: the spacing of the cloud as it is judged.
+    """
+
+    cloud: PointCloud
+    table: AbstractIndex | None
+    exact: AbstractIndex
+    mean: Float[Array, " d"]
+    spacing: Scalar
+    within: Scalar
+    fault: Int[Array, ""]
+    num_dropped: Int[Array, ""]
 
 
 def prepare_scan(
     method: AbstractRegistrar,
     points: Float[Array, "n d"],
     mask: Bool[Array, " n"],
+    viewpoint: Float[Array, " d"] | None,
     radius: Scalar,
     *,
     with_table: bool,
-) -> tuple[
-    PointCloud, AbstractIndex | None, AbstractIndex, Float[Array, " d"], Scalar, Scalar
-]:
-    """One scan: cloud, table, exact index, centroid, spacing and that as judged."""
+) -> PreparedScan:
+    """One scan by itself, in a unit that is given; NaN stands for no viewpoint."""
+    points, mask, dropped = clean(points, mask)
     mean = centroid(points, mask)
     method = method.in_frames(Frames(mean, mean, radius))
     centred = (points - mean[None]) / radius
@@ -69,7 +84,10 @@ def prepare_scan(
         within = median_spacing(judged.points, judged.mask)
     exact = index_within(judged.points, judged.mask, within)
     table = index_of(method, cloud) if with_table else None
-    return cloud, table, exact, mean, spacing, within
+    if viewpoint is not None:
+        cloud = cloud.seen_from((viewpoint - mean) / radius)
+    fault = _fault(cloud, rms_radius(points, mask) / radius, spacing)
+    return PreparedScan(cloud, table, exact, mean, spacing, within, fault, dropped)
 
 
 @kept_program
@@ -80,13 +98,12 @@ def prepare_scans(
     viewpoints: Float[Array, "v d"] | None = None,
     positions: ScanPositions | None = None,
     *,
-    side_by_side: bool = False,
     to_search: bool = False,
 ) -> PreparedScans:
-    """Prepares all scans; NaN stands for an unknown viewpoint.
+    """Prepares all scans inside of one program; NaN stands for an unknown viewpoint.
 
-    Side by side their derivatives are right under `vmap`, too: in a loop JAX leaves the
-    rules for them out, and what it takes instead is not a number.
+    Side by side: in a loop JAX leaves the rules for derivatives out under `vmap`, and
+    what it takes instead is not a number.
 
     Args:
         method: of registration.
@@ -94,46 +111,60 @@ def prepare_scans(
         mask: which of them are valid.
         viewpoints: where the scanners stood, or None.
         positions: likewise, in the world.
-        side_by_side: whether under `vmap` rather than in a loop.
         to_search: whether most pairs are searched for, so that local features pay.
     """
-    points, mask, dropped = clean(points, mask)
-    radius = common_radius(points, mask)
+    num, held = len(points), holds_tables(len(points))
+    radius = common_radius(jax.vmap(rms_radius)(*clean(points, mask)[:2]))
+    one = partial(prepare_scan, method, radius=radius, with_table=held)
+    scan = jax.vmap(one)(points, mask, viewpoints)
+    cloud = scan.cloud
+    if to_search and held:
+        spacing = common_spacing(scan.within)
+        cloud = jax.vmap(partial(with_features, method, spacing=spacing))(cloud)
+    return gathered(scan._replace(cloud=cloud), radius, positions, num)
 
-    def one(scan: tuple[Array, Array]) -> tuple:
-        held = len(points) <= _MOST_TABLES
-        return prepare_scan(method, *scan, radius, with_table=held)
 
-    num_rows = points.shape[1]
-    if side_by_side:
-        prepared = jax.vmap(one)((points, mask))
-    else:
-        prepared = map_side_by_side(one, (points, mask), num_rows)
-    clouds, tables, exact, mean, spacing, judged = prepared
-    if viewpoints is not None:
-        eyes = (viewpoints - mean) / radius
-        clouds = lax.map(lambda scan: scan[0].seen_from(scan[1]), (clouds, eyes))
-    if to_search and len(points) <= _MOST_TABLES:
-        described = partial(with_features, method, spacing=_common_spacing(judged))
-        clouds = map_side_by_side(described, clouds, num_rows)
-    fault = _fault(clouds, jax.vmap(rms_radius)(points, mask) / radius, spacing)
+def holds_tables(num_scans: int) -> bool:
+    """Whether tables and features of so many scans are held."""
+    return num_scans <= _MOST_TABLES
+
+
+def gathered(
+    scan: PreparedScan, radius: Scalar, positions: ScanPositions | None, num: int
+) -> PreparedScans:
+    """Scans as every stage has them.
+
+    Args:
+        scan: all of them, those that are padding last.
+        radius: their unit.
+        positions: about where their scanners stood, or None.
+        num: how many there are.
+    """
     return PreparedScans(
-        clouds, tables, exact, mean, radius, spacing, fault, dropped, positions
+        clouds=scan.cloud,
+        tables=scan.table,
+        exact=scan.exact,
+        mean=scan.mean,
+        radius=radius,
+        spacing=scan.spacing,
+        fault=scan.fault,
+        num_dropped=scan.num_dropped,
+        ids=jnp.arange(len(scan.fault), dtype=jnp.int32),
+        count=jnp.asarray(num, jnp.int32),
+        positions=positions,
     )
 
 
-def _common_spacing(spacing: Float[Array, " v"]) -> Scalar:
+def common_spacing(spacing: Float[Array, " v"]) -> Scalar:
     """The coarsest, at most twice the middle one: a scan may be a few dots."""
     known = jnp.where(spacing > 0, spacing, jnp.nan)
     coarsest = jnp.minimum(jnp.nanmax(known), 2 * jnp.nanmedian(known))
     return jnp.nan_to_num(coarsest)
 
 
-def _fault(
-    clouds: PointCloud, size: Float[Array, " v"], spacing: Float[Array, " v"]
-) -> Int[Array, " v"]:
-    """What is wrong with each scan, see `PreparedScans`."""
+def _fault(cloud: PointCloud, size: Scalar, spacing: Scalar) -> Int[Array, ""]:
+    """What is wrong with a scan, see `PreparedScans`."""
     differs = (size > OTHER_UNIT) | (size < 1 / OTHER_UNIT)
     fault = jnp.where(differs, Status.UNIT_DIFFERS, Status.CONVERGED)
-    enough = (jnp.sum(clouds.mask, axis=1) > clouds.points.shape[-1]) & (spacing > 0)
+    enough = (jnp.sum(cloud.mask) > cloud.points.shape[1]) & (spacing > 0)
     return jnp.where(enough, fault, Status.TOO_FEW_POINTS).astype(jnp.int32)

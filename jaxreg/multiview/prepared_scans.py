@@ -3,8 +3,10 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Motions, Scalar
 from jaxreg.cloud import Frames, PointCloud
@@ -32,6 +34,8 @@ class PreparedScans(eqx.Module):
             valid ones; UNIT_DIFFERS, its radius is not of the others' order; CONVERGED,
             nothing.
         num_dropped: `(v,)` rows of the input that were not finite.
+        ids: `(v,)` int32, number of each scan; of some scans, those among all.
+        count: int32, how many scans there are: further rows are padding, of no points.
         positions: about where their scanners stood, None if unknown.
     """
 
@@ -43,12 +47,24 @@ class PreparedScans(eqx.Module):
     spacing: Float[Array, " v"]
     fault: Int[Array, " v"]
     num_dropped: Int[Array, " v"]
+    ids: Int[Array, " v"]
+    count: Int[Array, ""]
     positions: ScanPositions | None = None
 
     @property
     def num_scans(self) -> int:
-        """V."""
+        """V, with those that are padding."""
         return self.mean.shape[0]
+
+    @property
+    def num_present(self) -> int:
+        """How many there are; outside of `jit`."""
+        return int(self.count)
+
+    @property
+    def present(self) -> Bool[Array, " v"]:
+        """Which rows are no padding."""
+        return jnp.arange(self.num_scans) < self.count
 
     @property
     def num_rows(self) -> int:
@@ -64,6 +80,16 @@ class PreparedScans(eqx.Module):
     def coarsest(self) -> Scalar:
         """The largest spacing of the scans that can be registered."""
         return jnp.max(jnp.where(self.usable, self.spacing, 0))
+
+    def of_pairs(
+        self, pairs: Int[np.ndarray, "e 2"]
+    ) -> tuple["PreparedScans", Int[Array, "e 2"]]:
+        """The scans of some pairs alone, and the pairs by their rows; outside of `jit`.
+
+        So programs of pairs do not depend on how many scans there are.
+        """
+        rows = np.arange(pairs.size, dtype=np.int32).reshape(pairs.shape)
+        return _some(self, jax.device_put(pairs.ravel())), jax.device_put(rows)
 
     def cloud(self, i: Int[Array, ""]) -> PointCloud:
         """One scan's thinned points."""
@@ -133,3 +159,19 @@ class PreparedScans(eqx.Module):
         R = lie.rotation(T_world_i)
         t = self.radius * lie.translation(T_world_i)
         return lie.compose(R, t - jnp.sum(R * self.mean[:, None], axis=-1))
+
+
+@kept_program
+def _some(scans: PreparedScans, rows: Int[Array, " r"]) -> PreparedScans:
+    def each(s: PreparedScans) -> tuple[object, ...]:
+        made = s.clouds, s.tables, s.exact
+        return *made, s.mean, s.spacing, s.fault, s.num_dropped, s.ids
+
+    def none(x: object) -> bool:
+        return x is None
+
+    some = jax.tree.map(lambda x: x[rows], each(scans))
+    out = eqx.tree_at(each, scans, some, is_leaf=none)
+    if scans.positions is None:
+        return out
+    return eqx.tree_at(lambda s: s.positions, out, scans.positions.some(rows))

@@ -36,6 +36,7 @@ from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.known_world import KnownWorld
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.prepare import prepare_scans
+from jaxreg.multiview.prepare_in_blocks import prepare_in_blocks
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.register_pairs import OnPairs, Rounds
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
@@ -214,14 +215,13 @@ def _of_chosen_pairs(
             progress(stage, done, total)
 
     report("preparing scans", 0, 1)
-    prepared = prepare_scans(method, *inputs, to_search=order == "any")
-    prepared = jax.block_until_ready(prepared)
+    prepared = prepare_in_blocks(method, *inputs, to_search=order == "any")
     report("preparing scans", 1, 1)
     words = words_of(prepared)
     before, first = _known(previous, prepared, order, words)
     hold = None
     if hold_previous and isinstance(previous, ReconstructionSolution):
-        hold = Held.of(previous, prepared.num_scans)
+        hold = Held.of(previous, prepared)
     with contextlib.ExitStack() as stack:
         workers = None
         if executor is not None:
@@ -231,12 +231,14 @@ def _of_chosen_pairs(
         rounds = Rounds(method, averaging, prepared, key, *told)
         motions = rounds.run(order, first, words)
     report("averaging and refining", 0, 1)
-    motions_padded = motions.padded(rounds.most)
+    motions_padded = motions.padded(rounds.num_rows)
+    if known is not None:
+        known = known.padded(prepared.num_scans)
     told = hold, known, rounds.overlaps
     solution = finish(method, averaging, prepared, motions_padded, *told)
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
-    return solution.of_pairs(len(motions.overlap))
+    return solution.of_pairs(len(motions.overlap)).of_scans(prepared.num_present)
 
 
 def _of_all_pairs(
@@ -247,7 +249,7 @@ def _of_all_pairs(
     known: KnownWorld | None,
 ) -> ReconstructionSolution:
     """What can be traced: no pair is chosen by what others told."""
-    prepared = prepare_scans(method, *inputs, side_by_side=True, to_search=True)
+    prepared = prepare_scans(method, *inputs, to_search=True)
     pairs = jax.device_put(all_pairs(prepared.num_scans))
     method, held = jax.lax.stop_gradient((method, prepared))
     motions = relative_motions(method, held, pairs, key)
@@ -278,14 +280,14 @@ def _known(
     num_old = (
         earlier.num_scans if earlier is not None else 1 + int(np.max(motions.pairs))
     )
-    if num_old > scans.num_scans:
+    if num_old > scans.num_present:
         raise ValueError(
-            f"previous: of {num_old} scans, but there are {scans.num_scans}."
+            f"previous: of {num_old} scans, but there are {scans.num_present}."
         )
     first = None
     if earlier is not None:
         rng = np.random.default_rng(num_old)
-        new = first_pairs(scans.num_scans, order, rng, words)
+        new = first_pairs(scans.num_present, order, rng, words)
         first = np.concatenate([motions.pairs, new[new[:, 1] >= num_old]])
         first = np.unique(first, axis=0)
     return motions.heard(scans), first

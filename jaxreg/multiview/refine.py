@@ -65,7 +65,7 @@ def refine(
     moving, scans = scans, lax.stop_gradient(scans)
 
     def averaged(motions: RelativeMotions) -> Placement:
-        again = place(motions, scans.num_scans, averaging, least)
+        again = place(motions, scans.num_scans, averaging, least, scans.count)
         return _updated(placement, again)
 
     placement = averaged(measured(scans, placement, least, pairs, exact=False))

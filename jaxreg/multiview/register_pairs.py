@@ -82,7 +82,7 @@ class Rounds:
         self.found: list[RelativeMotions] = []
         self.sure: dict[tuple[int, int], RelativeMotions] = {}
         self.rivals: dict[tuple[int, int], RelativeMotions] = {}
-        self.most = most_pairs(scans.num_scans)
+        self.num, self.most = scans.num_present, most_pairs(scans.num_present)
         here = platform_of(scans) == "cpu"
         self.batch = _ON_CPU if here else _ON_ACCELERATOR
 
@@ -99,7 +99,7 @@ class Rounds:
         bits = np.asarray(jax.random.key_data(self.key)).ravel()
         rng = np.random.default_rng(bits)
         if pairs is None:
-            pairs = first_pairs(self.scans.num_scans, order, rng, words)
+            pairs = first_pairs(self.num, order, rng, words)
             if order == "sequential":
                 self._follow()
         self.most = max(self.most, len(pairs))
@@ -108,7 +108,7 @@ class Rounds:
             if self.num_tried >= self.most:
                 break
             placement, tried, trusted, near = self._evidence()
-            part = np.asarray(placement.part)
+            part = np.asarray(placement.part)[: self.num]
             ids, overlap = np.asarray(near.pairs), np.asarray(near.overlap)
             pairs = next_pairs(tried, trusted, ids, overlap, part, rng, words)
             pairs = pairs[: self.most - self.num_tried]
@@ -116,6 +116,11 @@ class Rounds:
                 held = np.bincount(tried[trusted].ravel(), minlength=len(part)) >= SAFE
                 self._close_loops(pairs, placement, held)
         return RelativeMotions.joined(self.found)
+
+    @property
+    def num_rows(self) -> int:
+        """For the pairs of all rounds, and one of few numbers."""
+        return max(most_pairs(self.scans.num_scans), rounded_up(self.most))
 
     @property
     def num_tried(self) -> int:
@@ -153,9 +158,8 @@ class Rounds:
         elif batches:
 
             def run(batch: np.ndarray) -> RelativeMotions:
-                found = relative_motions(
-                    self.method, self.scans, jax.device_put(batch), self.key
-                )
+                some, rows = self.scans.of_pairs(batch)
+                found = relative_motions(self.method, some, rows, self.key)
                 return jax.block_until_ready(found)
 
             yield from enumerate(map_in_threads(run, batches, _THREADS))
@@ -171,7 +175,7 @@ class Rounds:
         """
         scans, step = self.scans, np.eye(self.scans.mean.shape[1] + 1)
         sure: dict[tuple[int, int], np.ndarray] = {}
-        gaps = [(k, k + gap) for gap in (1, 2) for k in range(scans.num_scans - gap)]
+        gaps = [(k, k + gap) for gap in (1, 2) for k in range(self.num - gap)]
         for done, (i, j) in enumerate(gaps):
             self.report("following the sequence", done, len(gaps))
             guess = step if j == i + 1 else None
@@ -201,9 +205,9 @@ class Rounds:
             if part[i] != part[j] or self._is_known((i, j)):
                 continue
             self.report("closing loops", done, len(pairs))
-            pair = jax.device_put(np.array([(i, j)], np.int32))
+            some, rows = self.scans.of_pairs(np.array([(i, j)], np.int32))
             T_i_j = lie.between(T[i], T[j])
-            one = descended(self.method, self.scans, pair, T_i_j[None])
+            one = descended(self.method, some, rows, T_i_j[None])
             self._keep(one, least if held[i] and held[j] else SURE)
 
     def _is_known(self, pair: tuple[int, int]) -> bool:
@@ -223,14 +227,15 @@ class Rounds:
     def _evidence(self) -> tuple[Placement, np.ndarray, np.ndarray, NearPairs]:
         """Present poses, the pairs tried, those trusted, and those that may overlap."""
         found = RelativeMotions.joined(self.found)
-        least = jnp.asarray(min_log_evidence(self.method), self.scans.radius.dtype)
-        num_scans = self.scans.num_scans
-        size, rows = self.most, np.arange(len(found.overlap))
-        if num_scans > _LARGE:
+        scans = self.scans
+        least = jnp.asarray(min_log_evidence(self.method), scans.radius.dtype)
+        size, rows = self.num_rows, np.arange(len(found.overlap))
+        if self.num > _LARGE:
             rows = np.flatnonzero(np.asarray(likely(found, least)).any(axis=1))
             size = rounded_up(len(rows), an_octave=1)
         motions = found.on_host(rows).padded(size)
-        placement = place(motions, num_scans, self.averaging, least)
+        told = self.averaging, least, scans.count
+        placement = place(motions, scans.num_scans, *told)
         trusted = np.zeros(len(found.overlap), bool)
         trusted[rows] = np.asarray(joins(placement.edge_weight))[: len(rows)]
         near = self.overlaps.of(placement, seed=len(found.overlap))

@@ -193,9 +193,9 @@ def relative_motions(
 ) -> RelativeMotions:
     """Registers scan j to scan i for each pair (i, j).
 
-    In the scans' centred frames. The random numbers of a pair depend on its ids alone,
-    not on the number of scans nor on its place in the batch, so any division of the
-    pairs into batches gives the same answer.
+    In the scans' centred frames; pairs by the rows of the scans. The random numbers of
+    a pair depend on its ids alone, not on the number of scans nor on its place in the
+    batch, so any division of the pairs into batches gives the same answer.
     """
 
     def one(pair: Array) -> RelativeMotions:
@@ -204,7 +204,7 @@ def relative_motions(
             scans.method_of(method, i, j),
             (scans.cloud(j), scans.cloud(i)),
             scans.table(method, i),
-            jax.random.fold_in(jax.random.fold_in(key, i), j),
+            jax.random.fold_in(jax.random.fold_in(key, scans.ids[i]), scans.ids[j]),
         )
         modes = jax.tree.map(lambda x: x[: num_kept(method)], solution.modes)
         T, usable = modes.T_target_source, scans.usable[i] & scans.usable[j]
@@ -213,7 +213,7 @@ def relative_motions(
             usable = usable & (solution.status != status)
         sound = usable & jnp.all(jnp.isfinite(T), axis=(1, 2))
         return RelativeMotions(
-            pair,
+            scans.ids[pair],
             jnp.where(sound[:, None, None], T, eye),
             jnp.where(sound, modes.overlap, 0),
             jnp.where(sound, modes.log_evidence, NO_EVIDENCE),

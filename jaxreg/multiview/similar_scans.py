@@ -31,7 +31,8 @@ def words_of(scans: PreparedScans) -> np.ndarray | None:
     described = scans.clouds.as_judged.described
     if described is None:
         return None
-    scan, row = np.nonzero(np.asarray(described.mask))
+    num = scans.num_present
+    scan, row = np.nonzero(np.asarray(described.mask)[:num])
     if not len(scan):
         return None
     from scipy.cluster.vq import vq  # at use: a start takes a tenth longer by it
@@ -39,7 +40,7 @@ def words_of(scans: PreparedScans) -> np.ndarray | None:
     features = np.asarray(described.even)[scan, row]
     drawn = np.random.default_rng(0).permutation(len(scan))[:_WORDS]
     word, _ = vq(features, features[drawn])
-    counts = np.zeros((scans.num_scans, len(drawn)))
+    counts = np.zeros((num, len(drawn)))
     np.add.at(counts, (scan, word), 1)
     return np.sqrt(counts / np.maximum(counts.sum(axis=1, keepdims=True), 1))
 

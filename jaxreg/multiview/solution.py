@@ -1,5 +1,7 @@
 """What `reconstruct` returns."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -86,6 +88,17 @@ class ReconstructionSolution(eqx.Module):
 
         parts = jax.tree.map(lambda x: x[:num], pairs_of(self))
         return eqx.tree_at(pairs_of, self, parts)
+
+    def of_scans(self, num: int) -> "ReconstructionSolution":
+        """Of the first so many scans; the others were padding."""
+
+        def scans_of(s: ReconstructionSolution) -> tuple[object, ...]:
+            poses = s.T_world_i, s.scan_status, s.placed
+            return *poses, s.component, s.num_dropped
+
+        parts = jax.tree.map(lambda x: x[:num], scans_of(self))
+        graph = dataclasses.replace(self.graph, num_poses=num)
+        return eqx.tree_at(lambda s: (*scans_of(s), s.graph), self, (*parts, graph))
 
     def __repr__(self) -> str:
         """One line: status, scans placed, what the others have, pairs trusted."""

@@ -159,8 +159,8 @@ def _registered(task: _Task) -> RelativeMotions:
                 f"A worker does not see {task.shared}: let TMPDIR of the caller name a "
                 "folder that all machines share."
             ) from err
-        pairs = jax.device_put(task.pairs)
-        found = relative_motions(method, scans, pairs, key)
+        some, rows = scans.of_pairs(task.pairs)
+        found = relative_motions(method, some, rows, key)
         return jax.tree.map(np.asarray, found)
 
 
