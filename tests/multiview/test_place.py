@@ -71,8 +71,8 @@ def test_the_only_pair_of_two_scans_needs_no_other_to_confirm_it():
     weak, told = np.full((1, 1), 0.15, np.float32), np.full((1, 1), 1.5, np.float32)
     ids = np.array([[0, 1]], np.int32)
     pair = RelativeMotions(*map(jnp.asarray, (ids, T_i_j, weak, told, weak))).padded(3)
-    for num_scans, parts in ((2, [0, 0]), (3, [0, 1, 2])):
-        found = place(pair, num_scans, None, LEAST)
+    for num_scans, parts in ((2, [0, 0, 2]), (3, [0, 1, 2])):
+        found = place(pair, 3, None, LEAST, jnp.asarray(num_scans))
         np.testing.assert_array_equal(found.part, parts)
 
 

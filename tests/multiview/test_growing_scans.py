@@ -1,0 +1,126 @@
+"""Programs that know no number of scans."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxreg as jr
+from jaxreg.multiview import place, prepare_in_blocks, relative_motions
+from jaxreg.multiview.prepared_scans import PreparedScans
+from jaxreg.testing.problems import motion, surface
+
+
+def _views(num: int) -> list[np.ndarray]:
+    """Views of one surface, each a little turned."""
+    whole = surface(200 * num, 3, 0)
+    T = [motion(3, 0.02 * k, 0.02, k) for k in range(num)]
+    views = [(whole[k::num] - x[:3, 3]) @ x[:3, :3] for k, x in enumerate(T)]
+    return [x.astype(np.float32) for x in views]
+
+
+SCANS = _views(8)
+
+
+def _solved(num: int) -> jr.ReconstructionSolution:
+    return jr.reconstruct(
+        SCANS[:num],
+        key=jax.random.key(3),
+        method=jr.ICP(),
+        averaging=jr.SpanningTree(),
+    )
+
+
+def _prepared(num: int) -> PreparedScans:
+    points = jnp.asarray(np.stack(SCANS[:num]))
+    mask = jnp.ones(points.shape[:2], bool)
+    return prepare_in_blocks.prepare_in_blocks(jr.ICP(), points, mask)
+
+
+def _watched(names: list[str], name: str, function: Callable, *args: object) -> object:
+    names.append(name)
+    return function(*args)
+
+
+@pytest.fixture
+def traced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is traced of the two programs that take longest to compile."""
+    jax.clear_caches()
+    names: list[str] = []
+    for module, name in ((relative_motions, "solve"), (place, "confirmed_parts")):
+        watched = partial(_watched, names, name, getattr(module, name))
+        monkeypatch.setattr(module, name, watched)
+    return names
+
+
+def test_one_more_scan_takes_the_programs_that_are_there(traced):
+    assert _solved(3).num_scans == 3
+    assert set(traced) == {"solve", "confirmed_parts"}
+    traced.clear()
+    assert _solved(4).num_scans == 4
+    assert not traced
+
+
+def test_pairs_of_more_scans_take_the_program_of_those_of_few(traced):
+    pairs, key = np.array([[0, 1], [1, 2]], np.int32), jax.random.key(0)
+    for num, calls in ((3, 1), (7, 0)):
+        traced.clear()
+        motions = relative_motions.relative_motions(
+            jr.ICP(), *_prepared(num).of_pairs(pairs), key
+        )
+        assert np.all(np.asarray(motions.overlap) > 0.5)
+        assert traced == ["solve"] * calls
+
+
+def test_padding_changes_no_answer(monkeypatch):
+    padded = _solved(5)
+    monkeypatch.setattr(prepare_in_blocks, "rows_for", lambda num: num)
+    exact = _solved(5)
+    assert int(padded.status) == jr.Status.CONVERGED
+    assert repr(padded) == repr(exact)
+    for mine, other in zip(
+        jax.tree.leaves(padded), jax.tree.leaves(exact), strict=True
+    ):
+        assert mine.shape == other.shape
+        np.testing.assert_allclose(mine, other, atol=1e-4)
+    np.testing.assert_allclose(padded.T_world_i, exact.T_world_i, atol=1e-5)
+
+
+def test_padding_is_the_last_scan_again_and_cannot_be_registered():
+    scans = _prepared(5)
+    assert (scans.num_scans, scans.num_present) == (6, 5)
+    np.testing.assert_array_equal(scans.present, [True] * 5 + [False])
+    np.testing.assert_array_equal(scans.usable, scans.present)
+    for x in jax.tree.leaves((scans.clouds, scans.exact, scans.mean, scans.spacing)):
+        assert len(x) == 6
+        np.testing.assert_array_equal(x[5], x[4])
+
+
+def test_scans_are_prepared_alike_in_any_block():
+    few, many = _prepared(2), _prepared(7)
+    # Their unit is the median radius of all.
+    unit = float(few.radius / many.radius)
+    for mine, other in ((few.mean, many.mean), (unit * few.spacing, many.spacing)):
+        np.testing.assert_allclose(mine[:2], other[:2], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        unit * few.clouds.points[:2], many.clouds.points[:2], atol=1e-5
+    )
+
+
+def test_a_pair_has_its_own_random_numbers_among_any_scans():
+    scans, key = _prepared(4), jax.random.key(5)
+    method = jr.MultiStart(num_starts=16, num_steps=4, num_modes=1, batch_size=16)
+    pairs = np.array([[1, 3], [0, 2]], np.int32)
+    found = [
+        relative_motions.relative_motions(method, *scans.of_pairs(some), key)
+        for some in (pairs, pairs[::-1])
+    ]
+    whole = relative_motions.relative_motions(method, scans, jnp.asarray(pairs), key)
+    np.testing.assert_array_equal(found[0].pairs, pairs)
+    told = map(jax.tree.leaves, (*found, whole))
+    for mine, turned, all_scans in zip(*told, strict=True):
+        np.testing.assert_array_equal(mine, turned[::-1])
+        np.testing.assert_allclose(mine, all_scans, atol=1e-5)
