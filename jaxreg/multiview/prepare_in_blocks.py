@@ -62,15 +62,19 @@ def prepare_in_blocks(
     """What `prepare_scans` returns, with rows of padding: the last scan's again."""
     num, held = len(points), holds_tables(len(points))
     block = _ON_CPU if platform_of(points) == "cpu" else _ON_ACCELERATOR
-    each = partial(_of_each, num=num, block=block)
-    radius = common_radius(jax.device_put(each(_radii, (points, mask))))
+    put = partial(jax.device_put, device=_home(points))
+    each = partial(_of_each, num=num, block=block, put=put)
+    radius = each(_radii, (points, mask))
+    radius[num:] = 0  # of those that are padding
+    radius = common_radius(put(radius))
 
     def prepared(scans: _Scans) -> PreparedScan:
         return _prepared(method, scans, radius, with_table=held)
 
     scan = each(prepared, (points, mask, viewpoints))
     if to_search and held:
-        spacing = common_spacing(jax.device_put(scan.within))
+        scan.within[num:] = 0
+        spacing = common_spacing(put(scan.within))
 
         def described(clouds: PointCloud) -> PointCloud:
             return _described(method, clouds, spacing)
@@ -79,10 +83,23 @@ def prepare_in_blocks(
     scan.fault[num:] = Status.TOO_FEW_POINTS
     if positions is not None:
         positions = positions.padded(rows_for(num))
-    return gathered(jax.device_put(scan), radius, positions, num)
+    return gathered(put(scan), radius, positions, num)
 
 
-def _of_each(run: Callable[[Any], Tree], scans: Any, num: int, block: int) -> Tree:
+def _home(points: Array) -> Any:
+    """The device that the scans were put on, None for the usual."""
+    here = points.devices()
+    usual = jax.device_put(0).devices()
+    return None if len(here) > 1 or here == usual else next(iter(here))
+
+
+def _of_each(
+    run: Callable[[Any], Tree],
+    scans: Any,
+    num: int,
+    block: int,
+    put: Callable[[Any], Any],
+) -> Tree:
     """What `run` tells of each scan, as NumPy arrays; of the last for the padding, too.
 
     Args:
@@ -90,13 +107,14 @@ def _of_each(run: Callable[[Any], Tree], scans: Any, num: int, block: int) -> Tr
         scans: arrays with a leading axis.
         num: how many of the rows are to be worked on.
         block: scans of a block.
+        put: brings arrays to where they are worked on.
     """
     scans = jax.tree.map(np.asarray, scans)
 
     def told(start: int) -> Tree:
         rows = np.minimum(np.arange(start, start + block), num - 1)
-        some = jax.device_put(jax.tree.map(lambda x: x[rows], scans))
-        return jax.tree.map(np.asarray, run(some))
+        some = jax.tree.map(lambda x: x[rows], scans)
+        return jax.tree.map(np.asarray, run(put(some)))
 
     starts = range(0, num, block)
     parts = map_in_threads(told, starts, num_cores())

@@ -15,11 +15,17 @@ from jaxreg.testing.problems import motion, surface
 
 
 def _views(num: int) -> list[np.ndarray]:
-    """Views of one surface, each a little turned."""
+    """Views of one surface, each a little turned and a little smaller."""
     whole = surface(200 * num, 3, 0)
     T = [motion(3, 0.02 * k, 0.02, k) for k in range(num)]
     views = [(whole[k::num] - x[:3, 3]) @ x[:3, :3] for k, x in enumerate(T)]
-    return [x.astype(np.float32) for x in views]
+    # Those of few points that are left are the innermost.
+    inside = [np.argsort(np.linalg.norm(x, axis=1)) for x in views]
+    some = [
+        x[rows[: 200 - 8 * k]]
+        for k, (x, rows) in enumerate(zip(views, inside, strict=True))
+    ]
+    return [x.astype(np.float32) for x in some]
 
 
 SCANS = _views(8)
@@ -34,10 +40,15 @@ def _solved(num: int) -> jr.ReconstructionSolution:
     )
 
 
+def _padded(num: int) -> tuple[jax.Array, jax.Array]:
+    points = np.zeros((num, len(SCANS[0]), 3), np.float32)
+    for row, scan in zip(points, SCANS, strict=False):
+        row[: len(scan)] = scan
+    return jnp.asarray(points), jnp.any(jnp.asarray(points) != 0, axis=-1)
+
+
 def _prepared(num: int) -> PreparedScans:
-    points = jnp.asarray(np.stack(SCANS[:num]))
-    mask = jnp.ones(points.shape[:2], bool)
-    return prepare_in_blocks.prepare_in_blocks(jr.ICP(), points, mask)
+    return prepare_in_blocks.prepare_in_blocks(jr.ICP(), *_padded(num))
 
 
 def _watched(names: list[str], name: str, function: Callable, *args: object) -> object:
@@ -94,6 +105,9 @@ def test_padding_is_the_last_scan_again_and_cannot_be_registered():
     assert (scans.num_scans, scans.num_present) == (6, 5)
     np.testing.assert_array_equal(scans.present, [True] * 5 + [False])
     np.testing.assert_array_equal(scans.usable, scans.present)
+    # It counts for nothing in what is common to all.
+    size = [np.sqrt(np.sum(np.var(x, axis=0))) for x in SCANS[:5]]
+    np.testing.assert_allclose(scans.radius, np.median(size), rtol=1e-5)
     for x in jax.tree.leaves((scans.clouds, scans.exact, scans.mean, scans.spacing)):
         assert len(x) == 6
         np.testing.assert_array_equal(x[5], x[4])
@@ -108,6 +122,14 @@ def test_scans_are_prepared_alike_in_any_block():
     np.testing.assert_allclose(
         unit * few.clouds.points[:2], many.clouds.points[:2], atol=1e-5
     )
+
+
+def test_scans_stay_on_the_device_that_they_were_put_on():
+    points, mask = jax.device_put(_padded(3), jax.devices()[1])
+    scans = prepare_in_blocks.prepare_in_blocks(jr.ICP(), points, mask)
+    assert scans.clouds.points.devices() == points.devices()
+    some, _ = scans.of_pairs(np.array([[0, 1]], np.int32))
+    assert some.clouds.points.devices() == points.devices()
 
 
 def test_a_pair_has_its_own_random_numbers_among_any_scans():
