@@ -40,6 +40,7 @@ def clean(
     return jnp.where(mask[..., None], points, 0), mask, dropped
 
 
+@jax.jit
 def common_radius(radius: Float[Array, " v"]) -> Scalar:
     """The median radius of the scans that have points; 1 if none has an extent."""
     radius = jnp.nanmedian(jnp.where(radius > 0, radius, jnp.nan))
@@ -155,6 +156,7 @@ def gathered(
     )
 
 
+@jax.jit
 def common_spacing(spacing: Float[Array, " v"]) -> Scalar:
     """The coarsest, at most twice the middle one: a scan may be a few dots."""
     known = jnp.where(spacing > 0, spacing, jnp.nan)
