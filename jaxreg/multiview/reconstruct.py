@@ -226,7 +226,8 @@ def _of_chosen_pairs(
         workers = None
         if executor is not None:
             workers = stack.enter_context(Workers(executor, method, prepared, key))
-        held = None if hold is None else np.asarray(hold.held)
+        num = prepared.num_present
+        held = None if hold is None else np.asarray(hold.held)[:num]
         told = before, on_pairs, report, workers, held
         rounds = Rounds(method, averaging, prepared, key, *told)
         motions = rounds.run(order, first, words)

@@ -2,23 +2,27 @@
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import pose_error
 
 import jaxreg as jr
-from jaxreg.multiview import place, prepare_in_blocks, relative_motions
+from jaxreg.multiview import likely_overlap, place, prepare_in_blocks, relative_motions
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.testing.problems import motion, surface
+
+
+T_WORLD = [motion(3, 0.02 * k, 0.02, k) for k in range(8)]
 
 
 def _views(num: int) -> list[np.ndarray]:
     """Views of one surface, each a little turned and a little smaller."""
     whole = surface(200 * num, 3, 0)
-    T = [motion(3, 0.02 * k, 0.02, k) for k in range(num)]
-    views = [(whole[k::num] - x[:3, 3]) @ x[:3, :3] for k, x in enumerate(T)]
+    views = [(whole[k::num] - x[:3, 3]) @ x[:3, :3] for k, x in enumerate(T_WORLD)]
     # Those of few points that are left are the innermost.
     inside = [np.argsort(np.linalg.norm(x, axis=1)) for x in views]
     some = [
@@ -31,12 +35,13 @@ def _views(num: int) -> list[np.ndarray]:
 SCANS = _views(8)
 
 
-def _solved(num: int) -> jr.ReconstructionSolution:
+def _solved(num: int, **told: Any) -> jr.ReconstructionSolution:
     return jr.reconstruct(
         SCANS[:num],
         key=jax.random.key(3),
         method=jr.ICP(),
         averaging=jr.SpanningTree(),
+        **told,
     )
 
 
@@ -98,6 +103,17 @@ def test_padding_changes_no_answer(monkeypatch):
         assert mine.shape == other.shape
         np.testing.assert_allclose(mine, other, atol=1e-4)
     np.testing.assert_allclose(padded.T_world_i, exact.T_world_i, atol=1e-5)
+
+
+def test_new_scans_lie_beside_many_that_are_held(monkeypatch):
+    monkeypatch.setattr(likely_overlap, "_ALL_UP_TO", 2)
+    before = _solved(4)
+    after = _solved(5, previous=before, hold_previous=True)
+    assert int(after.status) == jr.Status.CONVERGED
+    assert after.num_scans == 5
+    np.testing.assert_array_equal(after.T_world_i[:4], before.T_world_i)
+    T = np.linalg.inv(T_WORLD[0]) @ T_WORLD[4]
+    assert pose_error(after.T_world_i[4], T)[0] < 0.02
 
 
 def test_padding_is_the_last_scan_again_and_cannot_be_registered():
