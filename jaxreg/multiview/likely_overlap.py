@@ -70,7 +70,8 @@ class LikelyOverlap:
 
     def __init__(self, scans: PreparedScans, held: np.ndarray | None = None) -> None:
         self._scans = scans
-        self._held = np.zeros(scans.num_present, bool) if held is None else held
+        num = scans.num_present
+        self._held = np.zeros(num, bool) if held is None else held[:num]
         self._keys = np.zeros(0, np.int64)
         D = scans.mean.shape[1] + 1
         self._T_i_j, self._overlap = np.zeros((0, D, D)), np.zeros(0)

@@ -226,8 +226,7 @@ def _of_chosen_pairs(
         workers = None
         if executor is not None:
             workers = stack.enter_context(Workers(executor, method, prepared, key))
-        num = prepared.num_present
-        held = None if hold is None else np.asarray(hold.held)[:num]
+        held = None if hold is None else np.asarray(hold.held)
         told = before, on_pairs, report, workers, held
         rounds = Rounds(method, averaging, prepared, key, *told)
         motions = rounds.run(order, first, words)

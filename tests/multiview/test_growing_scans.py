@@ -105,8 +105,26 @@ def test_padding_changes_no_answer(monkeypatch):
     np.testing.assert_allclose(padded.T_world_i, exact.T_world_i, atol=1e-5)
 
 
-def test_new_scans_lie_beside_many_that_are_held(monkeypatch):
+def test_padding_is_in_no_pair_of_new_scans(monkeypatch):
     monkeypatch.setattr(likely_overlap, "_ALL_UP_TO", 2)
+    zero = jnp.zeros((), jnp.int32)
+    placed = place.Placement(
+        T_world_i=jnp.tile(jnp.eye(4), (6, 1, 1)),
+        part=jnp.zeros(6, jnp.int32),
+        edge_weight=jnp.zeros(1),
+        mode=jnp.zeros(1, jnp.int32),
+        status=zero,
+        trace=None,
+        world=zero - 1,
+        misfit=jnp.zeros(6, bool),
+    )
+    held = np.array([True] * 4 + [False] * 2)
+    near = likely_overlap.LikelyOverlap(_prepared(5), held).of(placed)
+    assert len(near.pairs)
+    np.testing.assert_array_equal(near.pairs[:, 1], 4)
+
+
+def test_new_scans_lie_beside_those_that_are_held():
     before = _solved(4)
     after = _solved(5, previous=before, hold_previous=True)
     assert int(after.status) == jr.Status.CONVERGED
