@@ -49,6 +49,7 @@ from .matching import Symmetric as Symmetric
 from .multiview import ReconstructionSolution as ReconstructionSolution
 from .multiview import RelativeMotions as RelativeMotions
 from .multiview import ScanPositions as ScanPositions
+from .multiview import ScanSet as ScanSet
 from .multiview import reconstruct as reconstruct
 from .multiview import scan_covariances as scan_covariances
 from .neighbours import AbstractIndex as AbstractIndex

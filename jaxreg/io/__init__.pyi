@@ -29,3 +29,5 @@ from .poses.kitti import write_kitti as write_kitti
 from .poses.stanford import read_conf as read_conf
 from .poses.tum import read_tum as read_tum
 from .poses.tum import write_tum as write_tum
+from .scan_sets import read_scan_set as read_scan_set
+from .scan_sets import write_scan_set as write_scan_set

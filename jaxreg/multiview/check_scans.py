@@ -19,10 +19,20 @@ from jaxreg.batching.padding import rounded_up, stacked
 _ON_POINT = 1e-6
 # Scans are thinned to some thousand points; of very large ones so many are enough.
 _MOST_POINTS = 1 << 19
+_WORDS = {1: "one or more", 2: "two or more"}
 
 
-def padded_scans(scans: object, mask: object) -> tuple[Array, Array]:
-    """Scans as `(v, n, d)` with a mask; points of very large ones in a list drawn."""
+def padded_scans(
+    scans: object, mask: object, *, least: int = 2, num_rows: int | None = None
+) -> tuple[Array, Array]:
+    """Scans as `(v, n, d)` with a mask; points of very large ones in a list drawn.
+
+    Args:
+        scans: as in `reconstruct`.
+        mask: as there.
+        least: how many scans are wanted.
+        num_rows: of the points of a scan in a list; None for what they need.
+    """
     if isinstance(scans, Sequence):
         if mask is not None:
             raise ValueError("mask: only for a padded array, not for a list of scans.")
@@ -34,30 +44,30 @@ def padded_scans(scans: object, mask: object) -> tuple[Array, Array]:
                     f"scans[{i}]: wanted shape (n, {arrays[0].shape[-1]}) like "
                     f"scans[0], found {x.shape}."
                 )
-        if len(arrays) < 2:
-            raise ValueError(f"scans: wanted two or more, found {len(arrays)}.")
-        arrays = [_drawn(x) for x in arrays]
+        if len(arrays) < least:
+            raise ValueError(f"scans: wanted {_WORDS[least]}, found {len(arrays)}.")
+        arrays = [_drawn(x, num_rows or _MOST_POINTS) for x in arrays]
         dtype = jnp.result_type(*arrays)
         lengths = np.array([len(x) for x in arrays])
-        rows = rounded_up(max(lengths.tolist()))
+        rows = num_rows or rounded_up(max(lengths.tolist()))
         row_mask = jnp.asarray(np.arange(rows) < lengths[:, None])
         return stacked([x.astype(dtype) for x in arrays], rows), row_mask
     points = as_float_array(scans, "scans")
     check_points(points, "scans")
-    if points.ndim != 3 or points.shape[0] < 2:
+    if points.ndim != 3 or points.shape[0] < least:
         raise ValueError(
-            "scans: wanted a list of two or more (n, d) arrays or a padded array "
+            f"scans: wanted a list of {_WORDS[least]} (n, d) arrays or a padded array "
             f"(v, n, d), found shape {points.shape}."
         )
     return points, check_mask(mask, points.shape[:2], "mask")
 
 
-def _drawn(points: Float[Array, "n d"]) -> Float[Array, "m d"]:
+def _drawn(points: Float[Array, "n d"], most: int) -> Float[Array, "m d"]:
     """All points, or as many at random as are enough; the same ones every time."""
     n = len(points)
-    if n <= _MOST_POINTS:
+    if n <= most:
         return points
-    return points[np.sort(np.random.default_rng(n).permutation(n)[:_MOST_POINTS])]
+    return points[np.sort(np.random.default_rng(n).permutation(n)[:most])]
 
 
 def checked_viewpoints(

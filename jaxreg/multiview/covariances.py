@@ -21,13 +21,12 @@ from jaxreg.geometry import lie
 from jaxreg.linear.small import product
 from jaxreg.local.covariance import answer, inverse_within
 from jaxreg.matching.problem import match
-from jaxreg.multiview.check_scans import padded_scans
-from jaxreg.multiview.far_scans import FarScans
-from jaxreg.multiview.prepare_in_blocks import prepare_in_blocks
+from jaxreg.multiview.given_scans import GivenScans
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import WIDTH_END, optimiser_of
+from jaxreg.multiview.scan_set import ScanSet
 from jaxreg.multiview.solution import ReconstructionSolution
-from jaxreg.particle import ParticleFilter
+from jaxreg.particle import AbstractSearch, ParticleFilter
 
 
 # Edge of a cell in sample spacings: some ten points of a scan.
@@ -40,7 +39,7 @@ _AROUND = 4
 
 
 def scan_covariances(
-    scans: ArrayLike,
+    scans: ArrayLike | ScanSet,
     solution: ReconstructionSolution,
     *,
     relative_to: int = 0,
@@ -54,7 +53,7 @@ def scan_covariances(
     sandwich this is over all trusted pairs at once.
 
     Args:
-        scans: as `reconstruct` got them.
+        scans: as `reconstruct` got them, or their `ScanSet` if it is for a search.
         solution: what it found.
         relative_to: the scan that is taken as known exactly.
         mask: as there.
@@ -70,27 +69,32 @@ def scan_covariances(
 
     Reference: Huber 1967; Conley 1999 (errors that neighbours share).
     """
-    far = FarScans(scans, mask)
-    points, row_mask = padded_scans(far.scans, mask)
-    moved = far.previous(solution)
+    if isinstance(scans, ScanSet):
+        scans.check_usable(None, mask, None)
+        if not isinstance(scans.method, AbstractSearch):
+            raise ValueError(
+                "scans: wanted a ScanSet for a search such as ParticleFilter(), found "
+                f"one for {type(scans.method).__name__}: give the scans themselves."
+            )
+    given = scans if isinstance(scans, ScanSet) else GivenScans.of(scans, mask, None)
+    v, d = given.shape
+    moved = given.far.previous(solution)
     num = moved.num_scans if isinstance(moved, ReconstructionSolution) else None
-    if not isinstance(moved, ReconstructionSolution) or num != len(points):
-        raise ValueError(f"solution: wanted one of {len(points)} scans, found {num}.")
-    if not 0 <= relative_to < len(points):
-        raise ValueError(
-            f"relative_to: wanted a scan below {len(points)}, found {relative_to}."
-        )
-    prepared = prepare_in_blocks(ParticleFilter(), points, row_mask)
-    T = np.tile(np.eye(points.shape[-1] + 1), (prepared.num_scans, 1, 1))
-    T[: len(points)] = np.asarray(moved.T_world_i, np.float64)
-    T = jnp.asarray(np.linalg.inv(T[relative_to]) @ T, points.dtype)
+    if not isinstance(moved, ReconstructionSolution) or num != v:
+        raise ValueError(f"solution: wanted one of {v} scans, found {num}.")
+    if not 0 <= relative_to < v:
+        raise ValueError(f"relative_to: wanted a scan below {v}, found {relative_to}.")
+    prepared, _ = given.prepared(ParticleFilter(), None, to_search=False)
+    T = np.tile(np.eye(d + 1), (prepared.num_scans, 1, 1))
+    T[:v] = np.asarray(moved.T_world_i, np.float64)
+    T = jnp.asarray(np.linalg.inv(T[relative_to]) @ T, given.dtype)
     edges, weight = _trusted(moved, relative_to)
     held = np.zeros(len(T), bool)
     held[edges[weight > 0].ravel()] = True
     first, told = jnp.asarray(relative_to), (jnp.asarray(edges), jnp.asarray(weight))
-    out = _covariances(prepared, T, first, *cast_floats(told, points.dtype))
+    out = _covariances(prepared, T, first, *cast_floats(told, given.dtype))
     out = jnp.where(jnp.asarray(held)[:, None, None], out, jnp.nan)
-    return out.at[relative_to].set(0)[: len(points)]
+    return out.at[relative_to].set(0)[:v]
 
 
 def _trusted(

@@ -13,7 +13,7 @@ from jaxreg.averaging.world.adjusted import Told
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution
-from jaxreg.registration.far import near_origin, pose_back, pose_moved
+from jaxreg.registration.far import pose_back, pose_moved
 
 
 _Known = tuple[Told, Told, Told, Told]
@@ -21,19 +21,18 @@ OnPairs = Callable[[RelativeMotions], None]
 
 
 class FarScans:
-    """Scans of which those that are far are moved to their middles.
+    """Scans of which those that were far are about their middles.
 
     Args:
-        scans, mask: as in `reconstruct`.
+        origin: `(v, d)` float64, what was subtracted from each (`near_origin`); None if
+            nothing was.
 
     Attributes:
-        scans: near their origins.
-        moved: whether any are; else nothing is changed.
-        origin: `(v, d)` float64, what was subtracted from each.
+        moved: whether any were far; else nothing is changed.
+        origin: likewise, without rows if nothing was moved.
     """
 
-    def __init__(self, scans: object, mask: object) -> None:
-        self.scans, origin = near_origin(scans, mask, "scans")
+    def __init__(self, origin: np.ndarray | None) -> None:
         self.moved = origin is not None
         self.origin = np.zeros((0, 0)) if origin is None else origin
 
@@ -115,15 +114,27 @@ class FarScans:
         return lambda motions: on_pairs(self._motions(motions, pose_back))
 
     def back(
-        self, solution: ReconstructionSolution, world: np.ndarray | None = None
+        self,
+        solution: ReconstructionSolution,
+        world: np.ndarray | None = None,
+        held: ReconstructionSolution | None = None,
     ) -> ReconstructionSolution:
         """Between the frames of the input, in float64 on the host.
 
         Args:
             solution: between the moved frames.
             world: the origin of what component 0 lies in, if that is a known world.
+            held: whose poses were held: there and back they would be rounded.
         """
-        return self._solution(solution, pose_back, world) if self.moved else solution
+        if not self.moved:
+            return solution
+        solution = self._solution(solution, pose_back, world)
+        if held is not None:
+            rows = np.flatnonzero(held.placed)
+            T = np.asarray(solution.T_world_i).copy()
+            T[rows] = np.asarray(held.T_world_i)[rows]
+            solution = eqx.tree_at(lambda s: s.T_world_i, solution, T)
+        return solution
 
     def _motions(self, motions: RelativeMotions, change: Callable) -> RelativeMotions:
         i, j = (self.origin[x] for x in np.asarray(motions.pairs).T)

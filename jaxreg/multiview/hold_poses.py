@@ -18,10 +18,10 @@ from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.place import Placement, place
-from jaxreg.multiview.prepare_in_blocks import rows_for
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import measured, wide_unless_given
 from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.scan_blocks import rows_for
 from jaxreg.multiview.solution import ReconstructionSolution
 
 

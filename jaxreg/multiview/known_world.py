@@ -48,15 +48,25 @@ class KnownWorld(eqx.Module):
         fixed: Told,
         control: Told,
         levels: Told,
-        scans: Float[Array, "v n d"],
+        shape: tuple[int, int],
+        dtype: np.dtype,
     ) -> "KnownWorld | None":
-        """From the arguments of `reconstruct`; None if they are."""
+        """From the arguments of `reconstruct`; None if they are.
+
+        Args:
+            priors: as there.
+            fixed: as there.
+            control: as there.
+            levels: as there.
+            shape: the number of scans, and that of dimensions.
+            dtype: of the scans.
+        """
         if all(x is None for x in (priors, fixed, control, levels)):
             return None
-        eye = jnp.eye(scans.shape[-1] + 1, dtype=scans.dtype)[None]
-        one = jnp.ones(1, scans.dtype)
+        num_scans, d = shape
+        eye, one = jnp.eye(d + 1, dtype=dtype)[None], jnp.ones(1, dtype)
         frames = jnp.zeros((1, 2), jnp.int32)
-        blank = PoseGraph(frames, eye, one, one > 0, None, len(scans))
+        blank = PoseGraph(frames, eye, one, one > 0, None, num_scans)
         known = check_known(priors, fixed, control, levels, blank)
         return None if known is None else cls(known)
 

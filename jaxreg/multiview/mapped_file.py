@@ -2,46 +2,47 @@
 
 import mmap
 import pickle
-from pathlib import Path
-from typing import Any
-
-import jax
+from typing import IO, Any
 
 
 # Bytes that an array begins at a multiple of, so that JAX takes it where it is.
 _ALIGNED = 64
 
 
-def write_tree(path: Path, tree: Any) -> None:
+def write_tree(file: IO[bytes], tree: Any) -> None:
     """A pickle of all but the arrays, then these one by one.
 
     Args:
-        path: of the file.
+        file: opened to be written, whatever it holds already.
         tree: whatever pickles, with NumPy arrays as leaves.
     """
     arrays: list[memoryview] = []
     rest = pickle.dumps(
         tree, protocol=5, buffer_callback=lambda x: arrays.append(x.raw())
     )
-    with path.open("wb") as file:
-        pickle.dump((rest, [x.nbytes for x in arrays]), file)
-        for x in arrays:
-            file.write(bytes(-file.tell() % _ALIGNED))
-            file.write(x)
+    pickle.dump((rest, [x.nbytes for x in arrays]), file)
+    for x in arrays:
+        file.write(bytes(-file.tell() % _ALIGNED))
+        file.write(x)
 
 
-def read_tree(path: Path) -> Any:
-    """What `write_tree` wrote, with arrays of JAX that lie in the mapped file on CPU.
+def read_tree(file: IO[bytes]) -> Any:
+    """What `write_tree` wrote, with arrays of NumPy that lie in the mapped file.
 
-    The file may be removed then where the system keeps what is mapped, as Linux does.
+    `jax.device_put` takes them where they are on a CPU. The file may be removed then
+    where the system keeps what is mapped, as Linux does.
+
+    Raises:
+        ValueError: if the file ends too early.
     """
-    with path.open("rb") as file:
-        rest, sizes = pickle.load(file)
-        start = file.tell()
-        whole = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    rest, sizes = pickle.load(file)
+    start = file.tell()
+    whole = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     arrays = []
     for size in sizes:
         start += -start % _ALIGNED
         arrays.append(whole[start : start + size])
         start += size
-    return jax.device_put(pickle.loads(rest, buffers=arrays))
+    if start > len(whole):
+        raise ValueError("ends too early")
+    return pickle.loads(rest, buffers=arrays)

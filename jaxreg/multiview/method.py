@@ -68,6 +68,13 @@ def with_features(
     return replace(cloud, judged=replace(cloud.judged, described=described))
 
 
+def without_features(cloud: PointCloud) -> PointCloud:
+    """The other way."""
+    if cloud.judged is None:
+        return replace(cloud, described=None)
+    return replace(cloud, judged=replace(cloud.judged, described=None))
+
+
 def solve(
     method: AbstractRegistrar,
     clouds: tuple[PointCloud, PointCloud],

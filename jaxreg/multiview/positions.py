@@ -74,9 +74,8 @@ class ScanPositions(BriefModule):
             if is_concrete(found) and not np.all(np.isfinite(found)):
                 raise ValueError(f"ScanPositions: {name}: wanted finite numbers.")
 
-    def check_fits(self, scans: Float[Array, "v n d"], method: object) -> None:
-        """Requires a position for each scan, and a search that can use it."""
-        wanted = scans.shape[0], scans.shape[2]
+    def check_fits(self, wanted: tuple[int, int], method: object) -> None:
+        """Requires positions of this shape, and a search that can use them."""
         if self.position.shape != wanted:
             raise ValueError(
                 f"positions: wanted shape {wanted}, found {self.position.shape}."

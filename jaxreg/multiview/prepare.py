@@ -118,11 +118,11 @@ def prepare_scans(
     radius = common_radius(jax.vmap(rms_radius)(*clean(points, mask)[:2]))
     one = partial(prepare_scan, method, radius=radius, with_table=held)
     scan = jax.vmap(one)(points, mask, viewpoints)
-    cloud = scan.cloud
+    cloud, spacing = scan.cloud, None
     if to_search and held:
         spacing = common_spacing(scan.within)
         cloud = jax.vmap(partial(with_features, method, spacing=spacing))(cloud)
-    return gathered(scan._replace(cloud=cloud), radius, positions, num)
+    return gathered(scan._replace(cloud=cloud), radius, spacing, positions, num)
 
 
 def holds_tables(num_scans: int) -> bool:
@@ -131,13 +131,18 @@ def holds_tables(num_scans: int) -> bool:
 
 
 def gathered(
-    scan: PreparedScan, radius: Scalar, positions: ScanPositions | None, num: int
+    scan: PreparedScan,
+    radius: Scalar,
+    spacing: Scalar | None,
+    positions: ScanPositions | None,
+    num: int,
 ) -> PreparedScans:
     """Scans as every stage has them.
 
     Args:
         scan: all of them, those that are padding last.
         radius: their unit.
+        spacing: of the samples that local features were made for; None without them.
         positions: about where their scanners stood, or None.
         num: how many there are.
     """
@@ -148,11 +153,20 @@ def gathered(
         mean=scan.mean,
         radius=radius,
         spacing=scan.spacing,
+        feature_spacing=spacing,
         fault=scan.fault,
         num_dropped=scan.num_dropped,
         ids=jnp.arange(len(scan.fault), dtype=jnp.int32),
         count=jnp.asarray(num, jnp.int32),
         positions=positions,
+    )
+
+
+def ungathered(scans: PreparedScans) -> PreparedScan:
+    """The other way; what `within` was is not needed any more."""
+    made = scans.clouds, scans.tables, scans.exact, scans.mean
+    return PreparedScan(
+        *made, scans.spacing, scans.spacing, scans.fault, scans.num_dropped
     )
 
 

@@ -1,27 +1,15 @@
-"""Scans prepared a few at a time, on all cores, outside of `jit`.
-
-The programs are of a few scans, whatever their number; and what follows finds rows for
-one of few numbers of scans, so that a map that grows takes the programs that it has.
-"""
-
-from collections.abc import Callable
-from functools import partial
-from itertools import chain
-from typing import Any, TypeVar
+"""Scans prepared outside of `jit`, all at once or some beside others that are."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxreg._core.platforms import platform_of
 from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Scalar
-from jaxreg.batching.padding import rounded_up
-from jaxreg.batching.side_by_side import map_side_by_side
-from jaxreg.batching.threads import map_in_threads, num_cores
 from jaxreg.cloud import PointCloud, rms_radius
-from jaxreg.multiview.method import with_features
+from jaxreg.multiview.method import without_features
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.prepare import (
     PreparedScan,
@@ -30,24 +18,11 @@ from jaxreg.multiview.prepare import (
     common_spacing,
     gathered,
     holds_tables,
-    prepare_scan,
+    ungathered,
 )
 from jaxreg.multiview.prepared_scans import PreparedScans
+from jaxreg.multiview.scan_blocks import ScanBlocks, rows_for
 from jaxreg.registrar import AbstractRegistrar
-
-
-Tree = TypeVar("Tree")
-
-# Points, which of them are valid, and the viewpoint or None; of one scan or of several.
-_Scans = tuple[Array, Array, Array | None]
-
-# Scans of a block: few, so that cores share them, but an accelerator wants more.
-_ON_CPU, _ON_ACCELERATOR = 4, 32
-
-
-def rows_for(num_scans: int) -> int:
-    """4, 6, 8, 12, 16, 24, ...: of so many scans programs are compiled."""
-    return rounded_up(num_scans, 4, an_octave=2)
 
 
 def prepare_in_blocks(
@@ -61,97 +36,103 @@ def prepare_in_blocks(
 ) -> PreparedScans:
     """What `prepare_scans` returns, with rows of padding: the last scan's again."""
     num, held = len(points), holds_tables(len(points))
-    block = _ON_CPU if platform_of(points) == "cpu" else _ON_ACCELERATOR
-    put = partial(jax.device_put, device=_home(points))
-    each = partial(_of_each, num=num, block=block, put=put)
-    radius = each(_radii, (points, mask))
+    on = ScanBlocks.of(points)
+    radius = on.each(_radii, (points, mask))
     radius[num:] = 0  # of those that are padding
-    radius = common_radius(put(radius))
-
-    def prepared(scans: _Scans) -> PreparedScan:
-        return _prepared(method, scans, radius, with_table=held)
-
-    scan = each(prepared, (points, mask, viewpoints))
+    radius = common_radius(on.put(radius))
+    scan = on.prepared(method, (points, mask, viewpoints), radius, with_table=held)
+    spacing = None
     if to_search and held:
         scan.within[num:] = 0
-        spacing = common_spacing(put(scan.within))
-
-        def described(clouds: PointCloud) -> PointCloud:
-            return _described(method, clouds, spacing)
-
-        scan = scan._replace(cloud=each(described, scan.cloud))
-    scan.fault[num:] = Status.TOO_FEW_POINTS
-    if positions is not None:
-        positions = positions.padded(rows_for(num))
-    return gathered(put(scan), radius, positions, num)
+        spacing = common_spacing(on.put(scan.within))
+        scan = on.described(method, scan, spacing)
+    return _gathered(on, scan, radius, spacing, positions)
 
 
-def _home(points: Array) -> Any:
-    """The device that the scans were put on, None for the usual."""
-    here = points.devices()
-    usual = jax.device_put(0).devices()
-    return None if len(here) > 1 or here == usual else next(iter(here))
-
-
-def _of_each(
-    run: Callable[[Any], Tree],
-    scans: Any,
-    num: int,
-    block: int,
-    put: Callable[[Any], Any],
-) -> Tree:
-    """What `run` tells of each scan, as NumPy arrays; of the last for the padding, too.
+def prepare_further(
+    method: AbstractRegistrar,
+    scans: PreparedScans,
+    points: Float[Array, "w n d"],
+    mask: Bool[Array, "w n"],
+    viewpoints: Float[Array, "w d"] | None = None,
+) -> PreparedScans:
+    """Scans that are prepared, and further ones, in the unit of the former.
 
     Args:
-        run: works on a block of scans.
-        scans: arrays with a leading axis.
-        num: how many of the rows are to be worked on.
-        block: scans of a block.
-        put: brings arrays to where they are worked on.
+        method: that of the former.
+        scans: those that are prepared; positions are left out.
+        points: of the further ones, of as many rows as the former had.
+        mask: which of them are valid.
+        viewpoints: of the further ones, or None.
     """
-    scans = jax.tree.map(np.asarray, scans)
+    num, on = scans.num_present, ScanBlocks.of(points)
+    held = scans.tables is not None and holds_tables(num + on.num)
+    spacing = scans.feature_spacing if held else None
+    old = ungathered(scans)
+    if not held:
+        old = old._replace(cloud=_undescribed(old.cloud), table=None)
+    old, viewpoints = _both_seen(old, viewpoints, points)
+    new = (points, mask, viewpoints)
+    new = on.prepared(method, new, scans.radius, with_table=held)
+    if spacing is not None:
+        new = on.described(method, new, spacing)
+    every = on._replace(num=num + on.num)
 
-    def told(start: int) -> Tree:
-        rows = np.minimum(np.arange(start, start + block), num - 1)
-        some = jax.tree.map(lambda x: x[rows], scans)
-        return jax.tree.map(np.asarray, run(put(some)))
+    def joined(x: Array, y: np.ndarray) -> np.ndarray:
+        out = np.empty((rows_for(every.num), *y.shape[1:]), y.dtype)
+        out[:num], out[num : every.num] = np.asarray(x)[:num], y[: on.num]
+        out[every.num :] = out[every.num - 1]
+        return out
 
-    starts = range(0, num, block)
-    parts = map_in_threads(told, starts, num_cores())
-    first = next(parts)
-    out = jax.tree.map(partial(_room, rows_for(num)), first)
-    for start, part in zip(starts, chain([first], parts), strict=True):
-        for every, x in zip(jax.tree.leaves(out), jax.tree.leaves(part), strict=True):
-            every[start : start + block] = x[: len(every) - start]
-    for every in jax.tree.leaves(out):
-        every[num:] = every[num - 1]
-    return out
+    scan = jax.tree.map(joined, old, new._replace(within=new.spacing))
+    return _gathered(every, scan, scans.radius, spacing, None)
 
 
-def _room(num: int, like: np.ndarray) -> np.ndarray:
-    """For so many rows like those of an array."""
-    return np.empty((num, *like.shape[1:]), like.dtype)
+def _both_seen(
+    old: PreparedScan, viewpoints: Array | None, points: Float[Array, "w n d"]
+) -> tuple[PreparedScan, Array | None]:
+    """Where viewpoints are known of scans before or of those after: NaN for the others.
+
+    Args:
+        old: the scans before.
+        viewpoints: of those after, or None.
+        points: of those after.
+    """
+    had = old.cloud.seen is not None
+    if had and viewpoints is None:
+        viewpoints = jnp.full(points[:, 0].shape, jnp.nan, points.dtype)
+    if viewpoints is None or had:
+        return old, viewpoints
+    return old._replace(cloud=_unseen(old.cloud)), viewpoints
+
+
+@kept_program
+def _undescribed(clouds: PointCloud) -> PointCloud:
+    return jax.vmap(without_features)(clouds)
+
+
+@kept_program
+def _unseen(clouds: PointCloud) -> PointCloud:
+    """From no known viewpoint."""
+    nowhere = jnp.full(clouds.points.shape[-1], jnp.nan, clouds.points.dtype)
+    return jax.vmap(lambda cloud: cloud.seen_from(nowhere))(clouds)
+
+
+def _gathered(
+    on: ScanBlocks,
+    scan: PreparedScan,
+    radius: Scalar,
+    spacing: Scalar | None,
+    positions: ScanPositions | None,
+) -> PreparedScans:
+    """With what is common to all, and padding marked."""
+    scan.fault[on.num :] = Status.TOO_FEW_POINTS
+    if positions is not None:
+        positions = positions.padded(rows_for(on.num))
+    return gathered(on.put(scan), radius, spacing, positions, on.num)
 
 
 @kept_program
 def _radii(scans: tuple[Array, Array]) -> Float[Array, " b"]:
     points, mask, _ = clean(*scans)
     return jax.vmap(rms_radius)(points, mask)
-
-
-@kept_program
-def _prepared(
-    method: AbstractRegistrar, scans: _Scans, radius: Scalar, *, with_table: bool
-) -> PreparedScan:
-    def one(scan: _Scans) -> PreparedScan:
-        return prepare_scan(method, *scan, radius, with_table=with_table)
-
-    return map_side_by_side(one, scans, scans[1].shape[1])
-
-
-@kept_program
-def _described(
-    method: AbstractRegistrar, clouds: PointCloud, spacing: Scalar
-) -> PointCloud:
-    described = partial(with_features, method, spacing=spacing)
-    return map_side_by_side(described, clouds, clouds.points.shape[1])

@@ -28,19 +28,17 @@ from jaxreg._core.log import log_solution, log_stage
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.averaging.world.adjusted import Told
-from jaxreg.multiview.check_scans import checked_viewpoints, padded_scans
 from jaxreg.multiview.choose_pairs import Order, all_pairs, first_pairs
 from jaxreg.multiview.conclude import finish
-from jaxreg.multiview.far_scans import FarScans
+from jaxreg.multiview.given_scans import GivenScans
 from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.known_world import KnownWorld
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.prepare import prepare_scans
-from jaxreg.multiview.prepare_in_blocks import prepare_in_blocks
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.register_pairs import OnPairs, Rounds
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
-from jaxreg.multiview.similar_scans import words_of
+from jaxreg.multiview.scan_set import OUTSIDE, ScanSet
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.multiview.workers import Workers, check_executor
 from jaxreg.particle import ParticleFilter
@@ -48,7 +46,7 @@ from jaxreg.registrar import AbstractRegistrar
 
 
 def reconstruct(
-    scans: ArrayLike,
+    scans: ArrayLike | ScanSet,
     *,
     key: Key,
     method: AbstractRegistrar | None = None,
@@ -77,7 +75,8 @@ def reconstruct(
 
     Args:
         scans: a list of `(n_i, d)` point sets, or a padded array `(v, n, d)`. Of a
-            scan in a list that has more than 524,288 points so many are drawn.
+            scan in a list that has more than 524,288 points so many are drawn. Or a
+            `ScanSet`, which is made ready once for many calls; not under `jit`.
         key: a `jax.random.key`; the same key gives the same answer.
         method: registers pairs, `ParticleFilter()` by default; any method of `register`
             does. Of an `AbstractIndexedRegistrar` several modes of a pair are kept.
@@ -153,51 +152,64 @@ def reconstruct(
     check_callable(progress, "progress")
     check_callable(on_pairs, "on_pairs")
     check_executor(executor)
-    far = FarScans(scans, mask)
-    points, row_mask = padded_scans(far.scans, mask)
-    eyes = checked_viewpoints(far.viewpoints(viewpoints), points, row_mask)
+    if isinstance(scans, ScanSet):
+        scans.check_usable(method, mask, viewpoints)
+        given, method = scans, scans.method
+    else:
+        given = GivenScans.of(scans, mask, viewpoints)
+        method = ParticleFilter() if method is None else method
+    far, shape = given.far, given.shape
+    held = None
+    if hold_previous and isinstance(previous, ReconstructionSolution):
+        held = previous
     positions, previous = far.positions(positions), far.previous(previous)
     on_pairs = far.hears(on_pairs)
-    method = ParticleFilter() if method is None else method
     check_method(method, AbstractRegistrar)
     check_instance(averaging, "averaging", AbstractAverager | None)
-    known = KnownWorld.of(priors, fixed, control, levels, points)
+    known = KnownWorld.of(priors, fixed, control, levels, shape, given.dtype)
     if hold_previous:
         _check_can_hold(previous, known)
     if positions is not None:
-        positions.check_fits(points, method)
-    inputs = points, row_mask, eyes, cast_floats(positions, points.dtype)
+        positions.check_fits(shape, method)
+        positions = cast_floats(positions, given.dtype)
     if far.moved:
         moved = far.known(priors, fixed, control, levels)
-        known = KnownWorld.of(*moved, points)
+        known = KnownWorld.of(*moved, shape, given.dtype)
     key, order = check_key(key), _checked(order)
-    if not (is_concrete(points) and is_concrete(key)):
-        _check_can_trace(order, (previous, on_pairs, executor), far)
+    if not (given.is_concrete and is_concrete(key)):
+        _check_can_trace(order, (previous, on_pairs, executor), given)
+        assert isinstance(given, GivenScans)
+        inputs = given.points, given.mask, given.viewpoints, positions
         solution = _of_all_pairs(method, averaging, inputs, key, known)
     else:
         told = order, previous, hold_previous, progress, on_pairs, executor
+        inputs = given, positions
         solution = _of_chosen_pairs(method, averaging, inputs, key, known, *told)
     origin = None if known is None else known.origin_of(solution)
-    solution = far.back(solution, origin)
+    solution = far.back(solution, origin, held)
     if known is not None:
         solution = known.in_world(solution, fixed, moved=far.moved)
     log_solution("reconstruct", solution)
     return solution
 
 
-def _check_can_trace(order: Order, told: tuple[object, ...], far: FarScans) -> None:
+def _check_can_trace(
+    order: Order, told: tuple[object, ...], given: GivenScans | ScanSet
+) -> None:
+    if isinstance(given, ScanSet):
+        raise ValueError(OUTSIDE)
     if order != "any" or any(x is not None for x in told):
         raise ValueError(
             "order, previous, on_pairs, executor: pairs are chosen outside of jit only."
         )
-    if far.moved:
+    if given.far.moved:
         raise ValueError("scans: far from their origins, moved outside of jit only.")
 
 
 def _of_chosen_pairs(
     method: AbstractRegistrar,
     averaging: AbstractAverager | None,
-    inputs: tuple[Any, ...],
+    inputs: tuple[GivenScans | ScanSet, ScanPositions | None],
     key: Key,
     known: KnownWorld | None,
     order: Order,
@@ -215,9 +227,10 @@ def _of_chosen_pairs(
             progress(stage, done, total)
 
     report("preparing scans", 0, 1)
-    prepared = prepare_in_blocks(method, *inputs, to_search=order == "any")
+    given, positions = inputs
+    prepared, said = given.prepared(method, positions, to_search=order == "any")
     report("preparing scans", 1, 1)
-    words = words_of(prepared)
+    words = None if said is None else said.used
     before, first = _known(previous, prepared, order, words)
     hold = None
     if hold_previous and isinstance(previous, ReconstructionSolution):

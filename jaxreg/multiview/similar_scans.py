@@ -11,6 +11,8 @@ Three things everyone should know to improve object retrieval, CVPR 2012 (square
 of counts).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from jaxreg.multiview.prepared_scans import PreparedScans
@@ -20,28 +22,50 @@ from jaxreg.multiview.prepared_scans import PreparedScans
 _WORDS = 512
 
 
-def words_of(scans: PreparedScans) -> np.ndarray | None:
-    """`(v, w)` how often each scan uses each word, as unit vectors; None if unknown.
+class Words(NamedTuple):
+    """How often scans use some words.
 
-    Of a scan without local features zeros, None if no scan has any.
+    Attributes:
+        vocabulary: `(w, f)` the features that are the words.
+        used: `(v, w)` unit vectors; zeros of a scan without local features.
+    """
+
+    vocabulary: np.ndarray
+    used: np.ndarray
+
+
+def words_of(scans: PreparedScans, before: Words | None = None) -> Words | None:
+    """What each scan says; None if no scan has local features.
 
     Args:
         scans: prepared scans.
+        before: of the first of them, whose words are the words of all.
     """
     described = scans.clouds.as_judged.described
     if described is None:
         return None
-    num = scans.num_present
-    scan, row = np.nonzero(np.asarray(described.mask)[:num])
+    first = 0 if before is None else len(before.used)
+    num = scans.num_present - first
+    scan, row = np.nonzero(np.asarray(described.mask)[first : first + num])
+    features = np.asarray(described.even)[first + scan, row]
+    if before is not None:
+        more = _used(features, scan, num, before.vocabulary)
+        return Words(before.vocabulary, np.concatenate([before.used, more]))
     if not len(scan):
         return None
-    from scipy.cluster.vq import vq  # at use: a start takes a tenth longer by it
-
-    features = np.asarray(described.even)[scan, row]
     drawn = np.random.default_rng(0).permutation(len(scan))[:_WORDS]
-    word, _ = vq(features, features[drawn])
-    counts = np.zeros((num, len(drawn)))
-    np.add.at(counts, (scan, word), 1)
+    return Words(features[drawn], _used(features, scan, num, features[drawn]))
+
+
+def _used(
+    features: np.ndarray, scan: np.ndarray, num: int, vocabulary: np.ndarray
+) -> np.ndarray:
+    """How often each of so many scans, whose features these are, uses each word."""
+    counts = np.zeros((num, len(vocabulary)))
+    if len(scan):
+        from scipy.cluster.vq import vq  # at use: a start takes a tenth longer by it
+
+        np.add.at(counts, (scan, vq(features, vocabulary)[0]), 1)
     return np.sqrt(counts / np.maximum(counts.sum(axis=1, keepdims=True), 1))
 
 

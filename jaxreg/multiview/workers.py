@@ -72,7 +72,8 @@ class Workers:
             prefix="jaxreg-scans-", ignore_cleanup_errors=True
         )
         self._shared = Path(self._folder.name) / "scans"
-        write_tree(self._shared, host)
+        with self._shared.open("wb") as file:
+            write_tree(file, host)
         self._kind_of_key = str(jax.random.key_impl(key))
 
     def __enter__(self) -> "Workers":
@@ -168,5 +169,6 @@ def _registered(task: _Task) -> RelativeMotions:
 def _shared(
     path: Path, kind_of_key: str
 ) -> tuple[AbstractRegistrar, PreparedScans, Key]:
-    method, scans, bits = read_tree(path)
+    with path.open("rb") as file:
+        method, scans, bits = jax.device_put(read_tree(file))
     return method, scans, jax.random.wrap_key_data(bits, impl=kind_of_key)

@@ -8,31 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from growing import SCANS, T_WORLD
 from helpers import pose_error
 
 import jaxreg as jr
-from jaxreg.multiview import likely_overlap, place, prepare_in_blocks, relative_motions
+from jaxreg.multiview import (
+    likely_overlap,
+    place,
+    prepare_in_blocks,
+    relative_motions,
+    scan_blocks,
+)
 from jaxreg.multiview.prepared_scans import PreparedScans
-from jaxreg.testing.problems import motion, surface
-
-
-T_WORLD = [motion(3, 0.02 * k, 0.02, k) for k in range(8)]
-
-
-def _views(num: int) -> list[np.ndarray]:
-    """Views of one surface, each a little turned and a little smaller."""
-    whole = surface(200 * num, 3, 0)
-    views = [(whole[k::num] - x[:3, 3]) @ x[:3, :3] for k, x in enumerate(T_WORLD)]
-    # Those of few points that are left are the innermost.
-    inside = [np.argsort(np.linalg.norm(x, axis=1)) for x in views]
-    some = [
-        x[rows[: 200 - 8 * k]]
-        for k, (x, rows) in enumerate(zip(views, inside, strict=True))
-    ]
-    return [x.astype(np.float32) for x in some]
-
-
-SCANS = _views(8)
 
 
 def _solved(num: int, **told: Any) -> jr.ReconstructionSolution:
@@ -93,7 +80,8 @@ def test_pairs_of_more_scans_take_the_program_of_those_of_few(traced):
 
 def test_padding_changes_no_answer(monkeypatch):
     padded = _solved(5)
-    monkeypatch.setattr(prepare_in_blocks, "rows_for", lambda num: num)
+    for module in (scan_blocks, prepare_in_blocks):
+        monkeypatch.setattr(module, "rows_for", lambda num: num)
     exact = _solved(5)
     assert int(padded.status) == jr.Status.CONVERGED
     assert repr(padded) == repr(exact)

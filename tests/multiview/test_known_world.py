@@ -202,7 +202,7 @@ def test_what_is_known_means_the_same_of_centred_scans():
     scans = prepare_scans(jr.ICP(), jnp.asarray(points), jnp.ones((2, 60), bool))
     half = rng.normal(size=(6, 6))
     W, T = half @ half.T + np.eye(6), motion(3, 3)
-    known = KnownWorld.of([(1, T, W)], None, None, None, jnp.asarray(points))
+    known = KnownWorld.of([(1, T, W)], None, None, None, (2, 3), points.dtype)
     assert known is not None
     moved = centred(dataclasses.replace(known.known, origin=None), scans).poses
     T_off = jnp.asarray(known.known.poses.T_world_prior[0]) @ lie.exp(

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,9 +21,15 @@ TREE = {
 }
 
 
+def _there_and_back(path: Path, tree: Any) -> Any:
+    with path.open("wb") as file:
+        write_tree(file, tree)
+    with path.open("rb") as file:
+        return read_tree(file)
+
+
 def test_a_tree_is_read_as_it_was_written(tmp_path: Path):
-    write_tree(tmp_path / "tree", TREE)
-    found = read_tree(tmp_path / "tree")
+    found = _there_and_back(tmp_path / "tree", TREE)
     assert jax.tree.structure(found) == jax.tree.structure(TREE)
     for before, after in zip(
         jax.tree.leaves(TREE), jax.tree.leaves(found), strict=True
@@ -34,8 +41,7 @@ def test_a_tree_is_read_as_it_was_written(tmp_path: Path):
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="no list of maps")
 def test_arrays_lie_in_the_file_and_outlive_its_name(tmp_path: Path):
     path, points = tmp_path / "tree", np.arange(30_000, dtype=np.float32)
-    write_tree(path, (np.arange(3), points))
-    _, found = read_tree(path)
+    _, found = jax.device_put(_there_and_back(path, (np.arange(3), points)))
     lines = Path("/proc/self/maps").read_text().splitlines()
     spans = [line.split()[0].split("-") for line in lines if line.endswith(str(path))]
     at = found.unsafe_buffer_pointer()

@@ -43,7 +43,7 @@ def test_scans_that_look_alike_share_surfaces(views):
     scans, world = views
     words = words_of(scans)
     assert words is not None
-    near = most_alike(words, 2)
+    near = most_alike(words.used, 2)
     assert near.shape == (NUM, 2)
     ids = range(NUM)
     chosen = [_shared(world, i, j) for i in ids for j in near[i].tolist()]
@@ -56,9 +56,10 @@ def test_the_most_alike_use_the_same_words_as_often(views):
     scans, _ = views
     words = words_of(scans)
     assert words is not None
-    np.testing.assert_allclose(np.linalg.norm(words, axis=1), 1)
-    close = words @ words.T
-    np.testing.assert_array_equal(np.argsort(-close)[:, 1], most_alike(words, 1)[:, 0])
+    used = words.used
+    np.testing.assert_allclose(np.linalg.norm(used, axis=1), 1)
+    near = most_alike(used, 1)[:, 0]
+    np.testing.assert_array_equal(np.argsort(-used @ used.T)[:, 1], near)
 
 
 def test_a_scan_without_features_is_like_no_other(views):
@@ -67,8 +68,26 @@ def test_a_scan_without_features_is_like_no_other(views):
     assert described is not None
     words = words_of(_with_mask(scans, described.mask.at[3].set(False)))
     assert words is not None
-    assert not np.any(words[3])
-    assert np.all(np.linalg.norm(np.delete(words, 3, axis=0), axis=1) > 0.99)
+    assert not np.any(words.used[3])
+    others = np.delete(words.used, 3, axis=0)
+    assert np.all(np.linalg.norm(others, axis=1) > 0.99)
+
+
+def test_scans_that_come_later_are_told_by_the_words_that_there_are(views):
+    scans, _ = views
+    first = words_of(eqx.tree_at(lambda s: s.count, scans, jnp.asarray(20, jnp.int32)))
+    assert first is not None
+    every = words_of(scans, first)
+    assert every is not None
+    assert every.vocabulary is first.vocabulary
+    assert every.used.shape == (NUM, len(first.vocabulary))
+    np.testing.assert_array_equal(every.used[:20], first.used)
+    described = scans.clouds.described
+    assert described is not None
+    features = np.asarray(described.even[23])[np.asarray(described.mask[23])]
+    _, nearest = KDTree(first.vocabulary).query(features)
+    counts = np.bincount(nearest, minlength=len(first.vocabulary))
+    np.testing.assert_allclose(every.used[23] ** 2, counts / counts.sum(), atol=1e-12)
 
 
 @pytest.mark.parametrize("held", [True, False])
