@@ -152,19 +152,13 @@ def reconstruct(
     check_callable(progress, "progress")
     check_callable(on_pairs, "on_pairs")
     check_executor(executor)
-    if isinstance(scans, ScanSet):
-        scans.check_usable(method, mask, viewpoints)
-        given, method = scans, scans.method
-    else:
-        given = GivenScans.of(scans, mask, viewpoints)
-        method = ParticleFilter() if method is None else method
+    given, method = _checked_scans(scans, mask, viewpoints, method)
     far, shape = given.far, given.shape
     held = None
     if hold_previous and isinstance(previous, ReconstructionSolution):
         held = previous
     positions, previous = far.positions(positions), far.previous(previous)
     on_pairs = far.hears(on_pairs)
-    check_method(method, AbstractRegistrar)
     check_instance(averaging, "averaging", AbstractAverager | None)
     known = KnownWorld.of(priors, fixed, control, levels, shape, given.dtype)
     if hold_previous:
@@ -191,6 +185,22 @@ def reconstruct(
         solution = known.in_world(solution, fixed, moved=far.moved)
     log_solution("reconstruct", solution)
     return solution
+
+
+def _checked_scans(
+    scans: ArrayLike | ScanSet,
+    mask: ArrayLike | None,
+    viewpoints: ArrayLike | None,
+    method: AbstractRegistrar | None,
+) -> tuple[GivenScans | ScanSet, AbstractRegistrar]:
+    """The scans, and the method that registers their pairs."""
+    if isinstance(scans, ScanSet):
+        scans.check_usable(method, mask, viewpoints)
+        return scans, scans.method
+    given = GivenScans.of(scans, mask, viewpoints)
+    method = ParticleFilter() if method is None else method
+    check_method(method, AbstractRegistrar)
+    return given, method
 
 
 def _check_can_trace(
