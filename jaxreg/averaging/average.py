@@ -199,7 +199,9 @@ def average(
         return average_batch(graph, method, init, key, batch_size, devices)
     one = check_graph(graph, "graph")
     start = check_init(init, one, "init")
-    known = check_known(priors, fixed, control, levels, one) if told else None
+    known = None
+    if told:
+        known = check_known(priors, fixed, control, levels, one, padded=True)
     if known is None:
         solution = average_one(one, method, start, key)
     else:

@@ -159,6 +159,7 @@ def _settled(
     dtype = T_world_i.dtype
     known = KnownPoses(
         frame=jnp.zeros(0, jnp.int32),
+        mask=jnp.zeros(0, bool),
         T_world_prior=jnp.zeros((0, d + 1, d + 1), dtype),
         information=jnp.zeros((0, k, k), dtype),
         fixed=fixed,

@@ -22,6 +22,7 @@ class KnownPoses(eqx.Module):
 
     Attributes:
         frame: `(p,)` the frame of each prior.
+        mask: `(p,)` False for rows that are padding.
         T_world_prior: `(p, d+1, d+1)` the pose that it should have.
         information: `(p, k, k)` of the right tangent error
             `log(inv(T_world_prior) T_world_i)`, or None where the graph has none.
@@ -30,6 +31,7 @@ class KnownPoses(eqx.Module):
     """
 
     frame: Int[Array, " p"]
+    mask: Bool[Array, " p"]
     T_world_prior: Float[Array, "p D D"]
     information: Float[Array, "p k k"] | None
     fixed: Bool[Array, " v"]
@@ -54,9 +56,8 @@ def anchored(graph: PoseGraph, known: KnownPoses) -> PoseGraph:
     i, j = graph.edges[:, 0], graph.edges[:, 1]
     ends, T, info = _from_world(graph, known, known.fixed[i], known.fixed[j])
     prior_ends = jnp.stack([jnp.zeros_like(known.frame), known.frame + 1], axis=1)
-    used = jnp.concatenate(
-        [graph.mask & ~(known.fixed[i] & known.fixed[j]), ~known.fixed[known.frame]]
-    )
+    free = known.mask & ~known.fixed[known.frame]
+    used = jnp.concatenate([graph.mask & ~(known.fixed[i] & known.fixed[j]), free])
     priors = jnp.ones(known.frame.shape, graph.weight.dtype)
     if info is not None and known.information is not None:
         info = jnp.concatenate([info, known.information])
@@ -76,10 +77,11 @@ def without_priors(known: KnownPoses) -> KnownPoses:
     """The fixed frames alone."""
     info = known.information
     return eqx.tree_at(
-        lambda k: (k.frame, k.T_world_prior, k.information),
+        lambda k: (k.frame, k.mask, k.T_world_prior, k.information),
         known,
         (
             known.frame[:0],
+            known.mask[:0],
             known.T_world_prior[:0],
             None if info is None else info[:0],
         ),
@@ -88,10 +90,12 @@ def without_priors(known: KnownPoses) -> KnownPoses:
 
 
 def fixed_as_priors(known: KnownPoses, num_fixed: int) -> KnownPoses:
-    """The fixed frames, so many, as nearly known."""
-    frame = jnp.nonzero(known.fixed, size=num_fixed)[0].astype(jnp.int32)
+    """The fixed frames, at most so many, as nearly known."""
+    first = jnp.argmax(known.fixed)
+    frame = jnp.nonzero(known.fixed, size=num_fixed, fill_value=first)[0]
     return KnownPoses(
-        frame=frame,
+        frame=frame.astype(jnp.int32),
+        mask=jnp.arange(num_fixed) < jnp.sum(known.fixed),
         T_world_prior=known.T_world_fixed[frame],
         information=None,
         fixed=jnp.zeros_like(known.fixed),
@@ -104,10 +108,11 @@ def joined_priors(known: KnownPoses, more: KnownPoses) -> KnownPoses:
     assert known.information is not None
     assert more.information is not None
     return eqx.tree_at(
-        lambda k: (k.frame, k.T_world_prior, k.information),
+        lambda k: (k.frame, k.mask, k.T_world_prior, k.information),
         known,
         (
             jnp.concatenate([known.frame, more.frame]),
+            jnp.concatenate([known.mask, more.mask]),
             jnp.concatenate([known.T_world_prior, more.T_world_prior]),
             jnp.concatenate([known.information, more.information]),
         ),

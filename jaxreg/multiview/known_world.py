@@ -20,7 +20,8 @@ from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager, Correntropy
 from jaxreg.averaging.world.adjusted import Told
 from jaxreg.averaging.world.adjustment import shown_information
-from jaxreg.averaging.world.arguments import Known, check_known
+from jaxreg.averaging.world.arguments import check_known
+from jaxreg.averaging.world.known import Known
 from jaxreg.averaging.world.solve import average_in_world, moved_back
 from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
@@ -67,7 +68,7 @@ class KnownWorld(eqx.Module):
         eye, one = jnp.eye(d + 1, dtype=dtype)[None], jnp.ones(1, dtype)
         frames = jnp.zeros((1, 2), jnp.int32)
         blank = PoseGraph(frames, eye, one, one > 0, None, num_scans)
-        known = check_known(priors, fixed, control, levels, blank)
+        known = check_known(priors, fixed, control, levels, blank, padded=True)
         return None if known is None else cls(known)
 
     @property
@@ -98,8 +99,10 @@ class KnownWorld(eqx.Module):
             least: log evidence of the pairs that count.
         """
         averaging = Correntropy() if averaging is None else averaging
-        known = dataclasses.replace(self.known, origin=None)
-        return _placed(known, scans, found, motions, averaging, least)
+        known = dataclasses.replace(self.known.of_any_number, origin=None)
+        told = known, scans, found, motions, averaging, least
+        placement, trust = _placed(*told)
+        return placement, self.known.without_padding(trust)
 
     def origin_of(self, solution: ReconstructionSolution) -> np.ndarray | None:
         """What is to be added to poses in the world, None where none lies in it."""

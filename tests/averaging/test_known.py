@@ -20,6 +20,8 @@ from jaxreg.averaging import (
     edge_report,
     pose_covariances,
 )
+from jaxreg.averaging.world import arguments, rigid_fit
+from jaxreg.averaging.world.adjustment import Adjustment
 from jaxreg.averaging.world.parts import brought
 from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
@@ -359,6 +361,7 @@ def test_of_many_priors_some_place_a_body():
     away = motions(rotations(rng, 1, 3, 1.0), rng.normal(size=(1, 3)))[0]
     poses = KnownPoses(
         frame=jnp.asarray(frame, jnp.int32),
+        mask=jnp.asarray(np.arange(600) < 599),
         T_world_prior=jnp.asarray(known, jnp.float32),
         information=None,
         fixed=jnp.asarray(np.zeros(20, bool)),
@@ -370,6 +373,74 @@ def test_of_many_priors_some_place_a_body():
     found = eqx.filter_jit(brought)(start, part, poses, None, None, unit)
     assert np.all(found.held)
     np.testing.assert_allclose(found.T_world_i, X, atol=1e-4)
+
+
+def test_one_more_of_each_kind_takes_the_programs_that_are_there(monkeypatch):
+    case, traced = Oracle(3), []
+    watched = Adjustment.solve
+
+    def solve(self: Adjustment, T: jax.Array) -> Any:
+        traced.append(len(self.usable))
+        return watched(self, T)
+
+    monkeypatch.setattr(Adjustment, "solve", solve)
+    graph = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), case.graph)
+    few = average(graph, MotionAveraging(), **case.told)
+    assert few.prior_weight is not None
+    assert (len(few.prior_weight), traced) == (6, [8])
+    told = {
+        "priors": [*case.priors, (6, case.X[6], case.priors[0][2])],
+        "fixed": [*case.fixed, (3, case.X[3])],
+        "control": case.control[:3],
+    }
+    more = average(graph, MotionAveraging(), **told)
+    assert more.prior_weight is not None
+    assert len(more.prior_weight) == 6
+    # By the program that was there: nothing was traced.
+    assert traced == [8]
+    assert more.status == Status.CONVERGED
+
+
+@pytest.mark.parametrize("levels", [False, True])
+def test_padding_of_what_is_known_changes_no_answer(levels, monkeypatch):
+    with jax.enable_x64(True):
+        case = Oracle(3)
+        # A wrong one of each kind comes first, and deviations are told too small: the
+        # middle one of the rows that there are tells how much.
+        priors = [(i, T, 30 * W) for i, T, W in case.priors]
+        control = [(i, u, q, 30 * W) for i, u, q, W in case.control]
+        i, u, q, W = control[1]
+        told: dict[str, Any] = {
+            "priors": [(3, case.X[0], priors[0][2]), *priors],
+            "fixed": case.fixed,
+            "control": [(i, u, q + 3, W), *control],
+        }
+        if levels:
+            told["levels"] = [(i, T[2, :3], 1e-2) for i, T in enumerate(case.X[:5])]
+        padded = average(case.graph, MotionAveraging(), **told)
+        monkeypatch.setattr(arguments, "_rounded", lambda num: num)
+        exact = average(case.graph, MotionAveraging(), **told)
+    assert padded.status == exact.status == Status.CONVERGED
+    np.testing.assert_allclose(padded.T_world_i, exact.T_world_i, atol=1e-9)
+    assert padded.prior_weight is not None
+    assert exact.prior_weight is not None
+    np.testing.assert_allclose(padded.prior_weight, exact.prior_weight, atol=1e-9)
+    assert np.all(np.asarray(padded.prior_weight)[[0, 3]] < 0.1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 7, 40])
+def test_of_many_points_choices_are_of_those_that_are_usable(count):
+    rng = np.random.default_rng(count)
+    usable = np.zeros(40, bool)
+    usable[rng.permutation(40)[:count]] = True
+    rows = np.asarray(rigid_fit._choices(jnp.asarray(usable), 3))
+    assert rows.shape == (rigid_fit.CHOICES, 3)
+    assert usable[rows].all() == (count >= 3)
+    if count >= 3:
+        assert all(len(set(row)) == 3 for row in rows.tolist())
+        assert len(np.unique(rows)) == count
+    else:
+        assert not usable[rows].all(axis=1).any()
 
 
 def few_points(deviation: float) -> tuple[np.ndarray, PoseGraph, Any]:

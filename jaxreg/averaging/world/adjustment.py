@@ -210,9 +210,9 @@ class Adjustment(eqx.Module):
     def usable(self) -> Bool[Array, " k"]:
         """Rows that can count: of frames in the world, of priors of free ones."""
         free = self.joined & ~self.poses.fixed
-        each = [free[self.poses.frame]]
+        each = [self.poses.mask & free[self.poses.frame]]
         each += [
-            self.joined[some.frame]
+            some.mask & self.joined[some.frame]
             for some in (self.points, self.levels)
             if some is not None
         ]

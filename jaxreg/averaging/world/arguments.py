@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from jaxreg._core.checks import (
     as_host_numbers,
@@ -14,42 +14,34 @@ from jaxreg._core.checks import (
     is_concrete,
     shown,
 )
+from jaxreg.averaging.world.known import Known
 from jaxreg.averaging.world.levels import Levels
 from jaxreg.averaging.world.points import ControlPoints
+from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses
 from jaxreg.graph.pose_graph import PoseGraph
 
 
-class Known(eqx.Module):
-    """Poses, points and tilts that are known.
-
-    Attributes:
-        poses: priors and fixed frames, of which there may be none.
-        points: control points, or None without any.
-        levels: tilts, or None without any.
-        origin: `(d,)` float64 on the host, subtracted from all positions in the world,
-            which may be map coordinates; None where a number is traced.
-        num_fixed: how many frames are fixed (static).
-    """
-
-    poses: KnownPoses
-    points: ControlPoints | None
-    levels: Levels | None
-    origin: np.ndarray | None
-    num_fixed: int = eqx.field(static=True)
-
-    @property
-    def num_rows(self) -> int:
-        """How many priors, points and levels there are."""
-        some = (self.poses, self.points, self.levels)
-        return sum(len(x.frame) for x in some if x is not None)
-
-
 def check_known(
-    priors: object, fixed: object, control: object, levels: object, graph: PoseGraph
+    priors: object,
+    fixed: object,
+    control: object,
+    levels: object,
+    graph: PoseGraph,
+    *,
+    padded: bool = False,
 ) -> Known | None:
-    """What `average` is told; None if that is nothing."""
+    """What `average` is told; None if that is nothing.
+
+    Args:
+        priors: as there.
+        fixed: as there.
+        control: as there.
+        levels: as there.
+        graph: as there.
+        padded: whether rows are added, for programs of few numbers of them.
+    """
     d = graph.dim
     D, k = d + 1, lie.tangent_dim(d)
     pose_rows = _rows(priors, "priors", graph, [(D, D), (k, k)])
@@ -70,9 +62,28 @@ def check_known(
     if all(isinstance(x, np.ndarray) and np.isfinite(x).all() for x in places):
         origin = np.array(places[0], np.float64)
     shift = np.zeros(d) if origin is None else origin
-    poses = _known_poses(pose_rows, fixed_rows, shift, graph)
-    points = _control_points(point_rows, shift, graph)
-    return Known(poses, points, _levels(level_rows, graph), origin, len(fixed_rows))
+    counts = len(pose_rows), len(point_rows), len(level_rows)
+    num_fixed = len(fixed_rows)
+    if padded:
+        num_fixed = _rounded(num_fixed)
+        pose_rows, point_rows, level_rows = (
+            rows + rows[:1] * (_rounded(len(rows)) - len(rows))
+            for rows in (pose_rows, point_rows, level_rows)
+        )
+    poses = _known_poses(pose_rows, fixed_rows, shift, graph, counts[0])
+    points = _control_points(point_rows, shift, graph, counts[1])
+    tilts = _levels(level_rows, graph, counts[2])
+    return Known(poses, points, tilts, origin, num_fixed, counts)
+
+
+def _rounded(num: int) -> int:
+    """None, 4, 6, 8, 12, 16, ..."""
+    return rounded_up(num, 4, an_octave=2) if num else 0
+
+
+def _mask(num_rows: int, count: int) -> Bool[Array, " n"]:
+    """Which rows are no padding."""
+    return jnp.asarray(np.arange(num_rows) < count)
 
 
 def _check_holds(num_points: int, num_levels: int, d: int) -> None:
@@ -194,6 +205,7 @@ def _known_poses(
     fixed: list[tuple[Any, ...]],
     origin: np.ndarray,
     graph: PoseGraph,
+    count: int,
 ) -> KnownPoses:
     dtype, D = graph.T_i_j.dtype, graph.dim + 1
     shift = np.zeros((D, D))
@@ -214,6 +226,7 @@ def _known_poses(
     information = _information(given, graph)
     return KnownPoses(
         frame=jnp.asarray(frame),
+        mask=_mask(len(frame), count),
         T_world_prior=T_prior,
         information=information,
         fixed=jnp.asarray(is_fixed),
@@ -245,7 +258,7 @@ def _check_all_or_none(given: list[Any], name: str) -> None:
 
 
 def _control_points(
-    rows: list[tuple[Any, ...]], origin: np.ndarray, graph: PoseGraph
+    rows: list[tuple[Any, ...]], origin: np.ndarray, graph: PoseGraph, count: int
 ) -> ControlPoints | None:
     if not rows:
         return None
@@ -255,18 +268,20 @@ def _control_points(
     told = given[0] is not None
     return ControlPoints(
         frame=jnp.asarray(np.array([row[0] for row in rows], np.int32)),
+        mask=_mask(len(rows), count),
         in_frame=jnp.stack([jnp.asarray(row[1], dtype) for row in rows]),
         in_world=jnp.stack([jnp.asarray(row[2] - origin, dtype) for row in rows]),
         information=jnp.stack([jnp.asarray(x, dtype) for x in given]) if told else None,
     )
 
 
-def _levels(rows: list[tuple[Any, ...]], graph: PoseGraph) -> Levels | None:
+def _levels(rows: list[tuple[Any, ...]], graph: PoseGraph, count: int) -> Levels | None:
     if not rows:
         return None
     dtype = graph.T_i_j.dtype
     return Levels(
         frame=jnp.asarray(np.array([row[0] for row in rows], np.int32)),
+        mask=_mask(len(rows), count),
         up=jnp.stack([jnp.asarray(up, dtype) for _, up, _ in rows]),
         deviation=jnp.stack([jnp.asarray(x, dtype) for *_, x in rows]),
     )

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import KnownPoses
@@ -14,11 +14,13 @@ class Levels(eqx.Module):
 
     Attributes:
         frame: `(l,)` the frame of each.
+        mask: `(l,)` False for rows that are padding.
         up: `(l, 3)` of length 1, in the frame.
         deviation: `(l,)` of each of its two angles, in radians.
     """
 
     frame: Int[Array, " l"]
+    mask: Bool[Array, " l"]
     up: Float[Array, "l 3"]
     deviation: Float[Array, " l"]
 
@@ -44,6 +46,7 @@ class Levels(eqx.Module):
         eye = jnp.eye(4, dtype=T.dtype)
         return KnownPoses(
             frame=self.frame,
+            mask=self.mask,
             T_world_prior=lie.compose(
                 product(turn, lie.rotation(T)), lie.translation(T)
             ),

@@ -59,7 +59,7 @@ def brought(
     # A pose is known by the places of its origin and of the tips of its axes.
     tips = jnp.concatenate([jnp.zeros((1, d)), unit * jnp.eye(d)])
     tips = tips.astype(T_part_i.dtype)
-    owner = jnp.repeat(poses.frame, d + 1)
+    owner, present = jnp.repeat(poses.frame, d + 1), jnp.repeat(poses.mask, d + 1)
     T_seen = T_part_i[poses.frame]
     arms = jax.vmap(lambda T: lie.act(T, tips))
     seen = arms(T_seen).reshape(-1, d)
@@ -67,19 +67,20 @@ def brought(
     tried = product(poses.T_world_prior, lie.inverse(T_seen))
     if points is not None:
         owner = jnp.concatenate([owner, points.frame])
+        present = jnp.concatenate([present, points.mask])
         seen = jnp.concatenate([seen, points.seen(T_part_i)])
         in_world = jnp.concatenate([in_world, points.in_world])
     fixed = jnp.zeros(v, bool).at[part].max(poses.fixed)
     if len(owner) == 0:
         return Brought(T_part_i, fixed[part])
-    posed = jnp.zeros(v, bool).at[part[poses.frame]].set(True)
+    posed = jnp.zeros(v, bool).at[part[poses.frame]].max(poses.mask)
     is_point = jnp.arange(len(owner)) >= len(poses.frame) * (d + 1)
 
     def fitted(name: Array) -> tuple[Array, Array]:
-        usable = part[owner] == name
+        usable = present & (part[owner] == name)
         some = tried
         if len(tried) > CHOICES:
-            some = tried[_spread(part[poses.frame] == name)]
+            some = tried[_spread(poses.mask & (part[poses.frame] == name))]
         up = None if levels is None else _up(levels, T_part_i, part, name)
         T, agrees, level = likeliest_place(seen, in_world, usable, some, up)
         agrees = (agrees & usable & is_point).astype(T.dtype)
@@ -89,7 +90,8 @@ def brought(
         return T, posed[name] | holds
 
     def one(name: Array) -> tuple[Array, Array]:
-        known = jnp.any(part[owner] == name) & (part[name] == name) & ~fixed[name]
+        told = jnp.any(present & (part[owner] == name))
+        known = told & (part[name] == name) & ~fixed[name]
         left = jnp.eye(d + 1, dtype=T_part_i.dtype), fixed[name]
         return control.cond(known, fitted, lambda _: left, name)
 
@@ -107,7 +109,7 @@ def _up(
 
     0 for a part without levels.
     """
-    own = part[levels.frame] == name
+    own = levels.mask & (part[levels.frame] == name)
     seen = levels.seen(T_part_i)
     tried = seen[_spread(own)]
 

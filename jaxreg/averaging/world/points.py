@@ -10,7 +10,7 @@ translation back by half of its turn). It says nothing of what one point leaves 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg.averaging.world.levels import turned
 from jaxreg.geometry import lie
@@ -23,6 +23,7 @@ class ControlPoints(eqx.Module):
 
     Attributes:
         frame: `(c,)` the frame that sees each.
+        mask: `(c,)` False for rows that are padding.
         in_frame: `(c, d)` where it sees it.
         in_world: `(c, d)` where it lies.
         information: `(c, d, d)` of that position, in the axes of the world, or None:
@@ -30,6 +31,7 @@ class ControlPoints(eqx.Module):
     """
 
     frame: Int[Array, " c"]
+    mask: Bool[Array, " c"]
     in_frame: Float[Array, "c d"]
     in_world: Float[Array, "c d"]
     information: Float[Array, "c d d"] | None
@@ -67,6 +69,7 @@ class ControlPoints(eqx.Module):
         eye = jnp.eye(d + 1, dtype=R.dtype)
         return KnownPoses(
             frame=self.frame,
+            mask=self.mask,
             T_world_prior=lie.compose(R, self.in_world - turned(R, self.in_frame)),
             information=product(product(jnp.swapaxes(J, -1, -2), W), J),
             fixed=jnp.zeros(len(T_world_i), bool),

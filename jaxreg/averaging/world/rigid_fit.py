@@ -9,7 +9,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
 from jaxreg.averaging.world.levels import upright
@@ -50,7 +50,7 @@ def likeliest_place(
         up: of the body what points up in the world, 0 if that is not known.
     """
     num, d = seen.shape
-    rows = jnp.asarray(_choices(num, min(d, num)))
+    rows = _choices(usable, min(d, num))
     present = usable.astype(seen.dtype)
     whole = jnp.all(usable[rows], axis=1)
     tried = jax.vmap(lambda r: kabsch(seen[r], in_world[r], present[r]))(rows)
@@ -124,12 +124,26 @@ def _log_evidence(
     return total[best], deviation[best]
 
 
-def _choices(num: int, size: int) -> np.ndarray:
-    """Rows of points to fit, all choices if they are few; no key is needed."""
+def _choices(usable: Bool[Array, " c"], size: int) -> Int[Array, "n s"]:
+    """Rows of points to fit, all choices if they are few; no key is needed.
+
+    Else some of those that are usable, as far as these are enough.
+    """
+    num = len(usable)
     if math.comb(num, size) <= CHOICES:
-        return np.array(list(itertools.combinations(range(num), size)))
-    draw = np.random.default_rng(0)
-    return np.stack([draw.choice(num, size, replace=False) for _ in range(CHOICES)])
+        return jnp.asarray(list(itertools.combinations(range(num), size)), jnp.int32)
+    shares, count = np.random.default_rng(0).random((size, CHOICES)), jnp.sum(usable)
+    picks: list[Array] = []
+    for share in shares:
+        left = jnp.maximum(count - len(picks), 1)
+        pick = jnp.floor(jnp.asarray(share, jnp.float32) * left).astype(jnp.int32)
+        pick = jnp.minimum(pick, left - 1)
+        # The number of one of those that are left, among all.
+        for taken in jnp.sort(jnp.stack(picks), axis=0) if picks else ():
+            pick = pick + (pick >= taken)
+        picks.append(pick)
+    usable_first = jnp.argsort(~usable, stable=True).astype(jnp.int32)
+    return usable_first[jnp.stack(picks, axis=-1)]
 
 
 def spans(in_world: Float[Array, "c d"], trust: Float[Array, " c"]) -> Bool[Array, ""]:

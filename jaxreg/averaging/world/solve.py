@@ -19,7 +19,7 @@ from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
 from jaxreg.averaging.gauge import average_graph
 from jaxreg.averaging.world.adjustment import Adjustment
-from jaxreg.averaging.world.arguments import Known
+from jaxreg.averaging.world.known import Known
 from jaxreg.averaging.world.parts import brought
 from jaxreg.geometry import lie
 from jaxreg.graph.anchored import (
@@ -83,9 +83,13 @@ def _averaged(
     unit: Float[Array, ""],
 ) -> AveragingSolution:
     """The graph alone, by programs that serve whatever is known; then adjusted."""
-    whole, start, label = _whole(graph, known, init)
+    rows = known.of_any_number
+    whole, start, label = _whole(graph, rows, init)
     found = average_graph(whole, method, start, key)
-    return _adjusted(graph, known, found, label, unit)
+    found = _adjusted(graph, rows, found, label, unit)
+    assert found.prior_weight is not None
+    trust = known.without_padding(found.prior_weight)
+    return eqx.tree_at(lambda s: s.prior_weight, found, trust)
 
 
 @kept_program
