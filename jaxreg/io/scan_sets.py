@@ -4,6 +4,7 @@ import dataclasses
 import pickle
 import sys
 from pathlib import Path
+from typing import IO
 
 import jax
 import numpy as np
@@ -15,9 +16,17 @@ from jaxreg.multiview.mapped_file import read_tree, write_tree
 
 
 _MARK = b"jaxreg scan set\n"
-# What unpickling raises of bytes that are no pickle, or of other classes.
-_DAMAGED = (pickle.UnpicklingError, EOFError, ValueError, LookupError, TypeError)
-_OTHER = (AttributeError, ImportError, MemoryError)
+# What unpickling raises of bytes that are no pickle, or of classes that are not there.
+_DAMAGED = (
+    pickle.UnpicklingError,
+    EOFError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ImportError,
+    MemoryError,
+)
 
 
 def write_scan_set(path: str | Path, scans: ScanSet) -> None:
@@ -50,27 +59,34 @@ def read_scan_set(path: str | Path) -> ScanSet:
     """
     try:
         with open(path, "rb") as file:
-            if file.readline(len(_MARK)) != _MARK:
-                raise InputError(f"{path}: is no file of jaxreg.io.write_scan_set.")
-            version = file.readline(100)
-            if version != _version():
-                raise InputError(
-                    f"{path}: is of jaxreg {version.decode(errors='replace').strip()}, "
-                    f"this is {_version().decode().strip()}.\nMake the set again from "
-                    "the scans."
-                )
-            found = read_tree(file)
+            _check_head(file, path)
+            found = _read(file, path)
     except OSError as err:
         raise InputError(f"{path}: cannot be read ({err.strerror}).") from err
-    except InputError:
-        raise
-    except (*_DAMAGED, *_OTHER) as err:
-        raise InputError(f"{path}: is damaged ({err}).") from err
-    if not isinstance(found, ScanSet):
-        raise InputError(f"{path}: is damaged (it holds no ScanSet).")
     # Origins stay in NumPy: their float64 is more than JAX may hold.
     ready = jax.device_put((found.method, found.scans))
     return dataclasses.replace(found, method=ready[0], scans=ready[1])
+
+
+def _check_head(file: IO[bytes], path: str | Path) -> None:
+    if file.readline(len(_MARK)) != _MARK:
+        raise InputError(f"{path}: is no file of jaxreg.io.write_scan_set.")
+    version = file.readline(100)
+    if version != _version():
+        raise InputError(
+            f"{path}: is of jaxreg {version.decode(errors='replace').strip()}, this is "
+            f"{_version().decode().strip()}.\nMake the set again from the scans."
+        )
+
+
+def _read(file: IO[bytes], path: str | Path) -> ScanSet:
+    try:
+        found = read_tree(file)
+    except _DAMAGED as err:
+        raise InputError(f"{path}: is damaged ({err}).") from err
+    if not isinstance(found, ScanSet):
+        raise InputError(f"{path}: is damaged (it holds no ScanSet).")
+    return found
 
 
 def _version() -> bytes:

@@ -65,6 +65,7 @@ def prepare_further(
         mask: which of them are valid.
         viewpoints: of the further ones, or None.
     """
+    points, mask = jax.device_put((points, mask), next(iter(scans.mean.devices())))
     num, on = scans.num_present, ScanBlocks.of(points)
     held = scans.tables is not None and holds_tables(num + on.num)
     spacing = scans.feature_spacing if held else None

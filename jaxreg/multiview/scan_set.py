@@ -26,8 +26,9 @@ OUTSIDE = "scans: a ScanSet is for calls outside of jit only."
 class ScanSet(eqx.Module):
     """Scans made ready for `reconstruct`: cleaned, thinned, indexed and described.
 
-    Pass it as `scans`; the answer is that of the scans themselves. A map that grows
-    prepares its new scans alone:
+    Pass it as `scans`; the answer is that of the scans themselves, but of a sequence,
+    whose scans have no local features by themselves. A map that grows prepares its new
+    scans alone:
 
         ready = jr.ScanSet.of(scans)
         sol = jr.reconstruct(ready, key=key)

@@ -110,6 +110,15 @@ def test_padded_arrays_join_as_lists_do(ready):
     assert int(listed.scans.fault[5]) == jr.Status.TOO_FEW_POINTS
 
 
+def test_a_set_stays_on_its_device():
+    device = jax.devices()[1]
+    scans = np.stack([x[:140] for x in SCANS[:3]])
+    ready = jr.ScanSet.of(jax.device_put(scans, device), method=METHOD)
+    more = ready.joined([SCANS[3]])
+    for x in jax.tree.leaves((ready.scans.clouds, more.scans.clouds)):
+        assert x.devices() == {device}
+
+
 def test_scans_far_from_their_origins_join():
     far = [np.asarray(x, np.float64) + FAR for x in SCANS[:5]]
     ready = jr.ScanSet.of(far[:4], method=METHOD)
