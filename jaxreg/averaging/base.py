@@ -15,7 +15,7 @@ from jaxreg._core.checks import is_concrete
 from jaxreg._core.loop import status_of
 from jaxreg._core.status import Status, counted
 from jaxreg._core.typing import Key, StatusArray
-from jaxreg.averaging.likelihood import log_evidence, nothing_agrees
+from jaxreg.averaging.likelihood import Likelihood
 from jaxreg.averaging.measures import frobenius, weighted_mean
 from jaxreg.averaging.trace import AveragingTrace
 from jaxreg.geometry import lie
@@ -130,17 +130,19 @@ def solution(
     kernel_width: Array | None = None,
     num_steps: Array | int = 0,
     trace: AveragingTrace | None = None,
+    likelihood: Likelihood | None = None,
     evidence: Float[Array, ""] | None = None,
 ) -> AveragingSolution:
-    """Fills in what is the same for every method."""
+    """Fills in what is the same for every method; the last two where they are known."""
     dtype = T_world_i.dtype
-    scale = graph.length_scale
+    likelihood = Likelihood.of(graph) if likelihood is None else likelihood
+    scale = likelihood.scale
     trust = jnp.ones(graph.weight.shape, dtype) if edge_weight is None else edge_weight
     done = jnp.asarray(True) if converged is None else converged
     width = jnp.full((2,), jnp.inf, dtype) if kernel_width is None else kernel_width
     trust = jnp.where(graph.mask & (graph.weight > 0), trust, 0)
-    evidence = log_evidence(graph, T_world_i) if evidence is None else evidence
-    none = nothing_agrees(jax.lax.stop_gradient(graph), evidence)
+    evidence = likelihood.log_evidence(T_world_i) if evidence is None else evidence
+    none = likelihood.nothing_agrees(evidence)
     status = jnp.where(none, Status.NO_AGREEMENT, status_of(done))
     return AveragingSolution(
         T_world_i=T_world_i,

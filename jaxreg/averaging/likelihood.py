@@ -38,9 +38,10 @@ hypotheses, and that rotation and translation may have deviations of their own.
 import math
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
 from jaxreg._core.quantile import nearest_rank
@@ -80,93 +81,121 @@ class Explained(NamedTuple):
     log_odds: Float[Array, " e"]
 
 
-def log_evidence(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
-) -> Float[Array, ""]:
-    """Log Lambda where each wrong motion is wrong on its own.
+class Likelihood(eqx.Module):
+    """Of the motions of a graph, for any poses; what all poses share is found once.
 
-    At most 0 if nothing agrees beyond what a tree agrees with. Does not depend on the
-    unit of length, the order of frames and edges, or a common motion of the poses.
-    Memory in proportion to the edges. All frames of a graph are joined.
+    Attributes:
+        graph: held, with all its frames joined.
+        scale: the graph's `length_scale`.
+        prior_odds: `(e,)`, see `prior_odds`.
+        free: how many poses are free, n - 1.
 
     Gradients: none (cut).
     """
-    return explained(graph, T_world_i, alone=True).log_ratio
 
+    graph: PoseGraph
+    scale: Float[Array, ""]
+    prior_odds: Float[Array, " e"]
+    free: Float[Array, ""]
 
-def nothing_agrees(graph: PoseGraph, evidence: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether there are edges to spare, and no evidence that any agrees.
+    @classmethod
+    def of(cls, graph: PoseGraph) -> "Likelihood":
+        """Of a graph whose frames are all joined."""
+        graph = jax.lax.stop_gradient(graph)
+        return cls(graph, graph.length_scale, prior_odds(graph), graph.num_held - 1)
 
-    Args:
-        graph: whose frames are all joined.
-        evidence: `log_evidence` of the answer. Where it has none, because wrong motions
-            pulled on it, the spanning tree of greatest weight may have some.
-    """
-    spare = jnp.sum(graph.weight > 0) > graph.num_held - 1
+    def log_evidence(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, ""]:
+        """Log Lambda where each wrong motion is wrong on its own.
 
-    def of_tree() -> Array:
+        At most 0 if nothing agrees beyond what a tree agrees with. Does not depend on
+        the unit of length, the order of frames and edges, or a common motion of the
+        poses. Memory in proportion to the edges.
+        """
+        return self.explained(T_world_i, alone=True).log_ratio
+
+    def nothing_agrees(self, evidence: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether there are edges to spare, and no evidence that any agrees.
+
+        Args:
+            evidence: `log_evidence` of the answer. Where it has none, because wrong
+                motions pulled on it, the spanning tree of greatest weight may have
+                some.
+        """
+        graph = self.graph
         args = (graph.edges, graph.T_i_j, graph.weight, graph.num_poses)
-        return log_evidence(graph, trees.maximum_spanning_tree(*args).T_world_i) <= 0
 
-    none = spare & (evidence <= 0)
-    return control.cond(none, of_tree, lambda: jnp.asarray(False))
+        def of_tree() -> Array:
+            T = trees.maximum_spanning_tree(*args).T_world_i
+            return self.log_evidence(T) <= 0
 
+        none = (jnp.sum(graph.weight > 0) > self.free) & (evidence <= 0)
+        return control.cond(none, of_tree, lambda: jnp.asarray(False))
 
-def explained(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"], *, alone: bool = False
-) -> Explained:
-    """Log Lambda, and what is likeliest.
+    def agreed_share(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, ""]:
+        """The share of the edges to spare that are likelier right than wrong.
 
-    Args:
-        graph: whose frames are all joined.
-        T_world_i: `(v, d+1, d+1)`.
-        alone: each wrong motion is wrong on its own (D = k), and the deviation is that
-            of a component, at most a quarter: at a half, what poses fitted to random
-            motions gain is more than Laplace's method takes off. Else wrong ones may
-            agree with each other.
+        A tree agrees with its own edges, wherever it leads: only those beyond count,
+        but where there are none. 0 without edges.
+        """
+        present = jnp.sum(self.graph.weight > 0)
+        right = jnp.sum(self.explained(T_world_i).log_odds > 0)
+        tree = self.free.astype(right.dtype)
+        tree = jnp.where(present > tree, tree, 0)
+        count = jnp.maximum(present - tree, 1).astype(self.graph.weight.dtype)
+        return (right - tree) / count
 
-    Gradients: none (cut).
-    """
-    dimension, deviations = _DIMENSION, DEVIATIONS
-    if alone:
-        dimension, deviations = float(lie.tangent_dim(graph.dim)), DEVIATIONS[1:]
-    graph, T_world_i = jax.lax.stop_gradient((graph, T_world_i))
-    sq, weigh = squared_errors(graph, T_world_i), prior_odds(graph)
-    log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
-    prior = log_odds[:, None] + weigh[None]
-    none = jax.nn.softplus(prior)
-    near_ways, meant = _near_ways(graph, T_world_i, alone)  # (t, e)
-    both_sides = jnp.concatenate([near_ways, ~near_ways]).astype(sq.dtype)
-    allowed = log_odds[:, None] >= jnp.maximum(log_odds, 0)[None]  # near, far
-    free, reach = graph.num_held - 1, _reach(graph.dim)
+    def explained(
+        self, T_world_i: Float[Array, "v D D"], *, alone: bool = False
+    ) -> Explained:
+        """Log Lambda, and what is likeliest.
 
-    def log_gain(deviation: Array) -> tuple[Array, Array]:
-        """The logarithm of g for each edge, and for one that holds exactly."""
-        most = dimension * jnp.log(reach / deviation)
-        return most - sq / (2 * deviation**2), most
+        Args:
+            T_world_i: `(v, d+1, d+1)`.
+            alone: each wrong motion is wrong on its own (D = k), and the deviation is
+                that of a component, at most a quarter: at a half, what poses fitted to
+                random motions gain is more than Laplace's method takes off. Else wrong
+                ones may agree with each other.
+        """
+        graph, dimension, deviations = self.graph, _DIMENSION, DEVIATIONS
+        if alone:
+            dimension, deviations = float(lie.tangent_dim(graph.dim)), DEVIATIONS[1:]
+        T_i_j = graph.predicted(jax.lax.stop_gradient(T_world_i))
+        sq, weigh = squared_errors(graph, T_i_j, self.scale), self.prior_odds
+        log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
+        prior = log_odds[:, None] + weigh[None]
+        none = jax.nn.softplus(prior)
+        near_ways, meant = _near_ways(graph, T_i_j, self.scale, alone)  # (t, e)
+        both_sides = jnp.concatenate([near_ways, ~near_ways]).astype(sq.dtype)
+        allowed = log_odds[:, None] >= jnp.maximum(log_odds, 0)[None]  # near, far
+        reach = _reach(graph.dim)
 
-    def terms(deviation: Array) -> Array:
-        gain, most = log_gain(deviation)
-        each = jax.nn.softplus(prior + gain[None]) - none
-        each = jnp.where(graph.weight[None] > 0, each, 0)
-        sums = jnp.matmul(each, both_sides.T, precision=jax.lax.Precision.HIGHEST)
-        near, far = jnp.split(sums, 2, axis=1)
-        both = near[:, None] + far[None]  # near, far, t
-        may = allowed[..., None] & meant[None, None]
-        return jnp.where(may, both, -jnp.inf) - free * most
+        def log_gain(deviation: Array) -> tuple[Array, Array]:
+            """The logarithm of g for each edge, and for one that holds exactly."""
+            most = dimension * jnp.log(reach / deviation)
+            return most - sq / (2 * deviation**2), most
 
-    ladder = jnp.asarray(deviations, sq.dtype)
-    every = jax.lax.map(terms, ladder)
-    count = len(deviations) * jnp.sum(meant) * jnp.sum(allowed)
-    s, near, far, t = jnp.unravel_index(jnp.argmax(every), every.shape)
-    p = jnp.where(near_ways[t], log_odds[near], log_odds[far])
-    right = p + weigh + log_gain(ladder[s])[0]
-    ratio = jax.nn.logsumexp(every) - jnp.log(count.astype(sq.dtype))
-    return Explained(
-        jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf),
-        ladder[s],
-        jnp.where(graph.weight > 0, right, -jnp.inf),
-    )
+        def terms(deviation: Array) -> Array:
+            gain, most = log_gain(deviation)
+            each = jax.nn.softplus(prior + gain[None]) - none
+            each = jnp.where(graph.weight[None] > 0, each, 0)
+            sums = jnp.matmul(each, both_sides.T, precision=jax.lax.Precision.HIGHEST)
+            near, far = jnp.split(sums, 2, axis=1)
+            both = near[:, None] + far[None]  # near, far, t
+            may = allowed[..., None] & meant[None, None]
+            return jnp.where(may, both, -jnp.inf) - self.free * most
+
+        ladder = jnp.asarray(deviations, sq.dtype)
+        every = jax.lax.map(terms, ladder)
+        count = len(deviations) * jnp.sum(meant) * jnp.sum(allowed)
+        s, near, far, t = _place(jnp.argmax(every), every.shape)
+        p = jnp.where(near_ways[t], log_odds[near], log_odds[far])
+        right = p + weigh + log_gain(ladder[s])[0]
+        ratio = jax.nn.logsumexp(every) - jnp.log(count.astype(sq.dtype))
+        return Explained(
+            jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf),
+            ladder[s],
+            jnp.where(graph.weight > 0, right, -jnp.inf),
+        )
 
 
 def least_after_fitting(found: Explained) -> Float[Array, ""]:
@@ -178,28 +207,18 @@ def least_after_fitting(found: Explained) -> Float[Array, ""]:
     return found.log_ratio - jnp.sqrt(_DIMENSION / 2 * right)
 
 
-def agreed_share(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
-) -> Float[Array, ""]:
-    """The share of the edges to spare that are likelier right than wrong.
-
-    A tree agrees with its own edges, wherever it leads: only those beyond count, but
-    where there are none. 0 without edges.
-    """
-    present = jnp.sum(graph.weight > 0)
-    right = jnp.sum(explained(graph, T_world_i).log_odds > 0)
-    tree = graph.num_held.astype(right.dtype) - 1
-    tree = jnp.where(present > tree, tree, 0)
-    count = jnp.maximum(present - tree, 1).astype(graph.weight.dtype)
-    return (right - tree) / count
-
-
 def squared_errors(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+    graph: PoseGraph, T_i_j: Float[Array, "e D D"], scale: Float[Array, ""]
 ) -> Float[Array, " e"]:
-    """Squared angle (chordal) plus squared length over `length_scale` of each edge."""
-    rotation, translation = graph.differences(T_world_i)
-    return rotation / 2 + translation / graph.length_scale**2
+    """Squared angle (chordal) plus squared length over `scale` of each edge.
+
+    Args:
+        graph: the motions.
+        T_i_j: what poses make of them, `graph.predicted`.
+        scale: `graph.length_scale`.
+    """
+    rotation, translation = graph.differences_from(T_i_j)
+    return rotation / 2 + translation / scale**2
 
 
 def prior_odds(graph: PoseGraph) -> Float[Array, " e"]:
@@ -220,8 +239,17 @@ def _reach(dim: int) -> float:
     return (turns * ball) ** (1 / k) / math.sqrt(2 * math.pi)
 
 
+def _place(at: Int[Array, ""], shape: tuple[int, ...]) -> list[Int[Array, ""]]:
+    """The row along each axis of a number in an array."""
+    rows: list[Array] = []
+    for size in reversed(shape):
+        rows.append(jax.lax.rem(at, jnp.asarray(size, at.dtype)))
+        at = jax.lax.div(at, jnp.asarray(size, at.dtype))
+    return rows[::-1]
+
+
 def _near_ways(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"], alone: bool
+    graph: PoseGraph, T_i_j: Float[Array, "e D D"], scale: Float[Array, ""], alone: bool
 ) -> tuple[Bool[Array, "t e"], Bool[Array, " t"]]:
     """Whether an edge is near in each way, and which ways may be meant.
 
@@ -229,7 +257,7 @@ def _near_ways(
     more than `DENSE_LIMIT` frames drift tells false closures, and this would count it
     against right ones: a path that nothing bends holds all its steps exactly.
     """
-    near = _among_nearest(graph, T_world_i)
+    near = _among_nearest(graph, T_i_j, scale)
     meant = jnp.ones(len(near), bool)
     if alone or graph.num_poses > DENSE_LIMIT:
         return near, meant
@@ -240,17 +268,16 @@ def _near_ways(
 
 
 def _among_nearest(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+    graph: PoseGraph, T_i_j: Float[Array, "e D D"], scale: Float[Array, ""]
 ) -> Bool[Array, "t e"]:
     """Whether one end of an edge is among the t nearest measured neighbours of another.
 
-    For each t of `_NEAREST`. Nearness is that of the poses:
-    squared angle (chordal) and squared length over `length_scale`. Edges as near as
+    For each t of `_NEAREST`. Nearness is that of the poses, which make T_i_j of the
+    motions: squared angle (chordal) and squared length over `scale`. Edges as near as
     each other are so alike.
     """
-    gap = graph.predicted(T_world_i)
-    far = graph.dim - jnp.trace(lie.rotation(gap), axis1=-2, axis2=-1)
-    shift = jnp.sum(lie.translation(gap) ** 2, axis=-1) / graph.length_scale**2
+    far = graph.dim - jnp.trace(lie.rotation(T_i_j), axis1=-2, axis2=-1)
+    shift = jnp.sum(lie.translation(T_i_j) ** 2, axis=-1) / scale**2
     far = jnp.where(graph.weight > 0, far + shift, jnp.inf)
     ends = graph.edges.T
     frame, ascending = jax.lax.sort(

@@ -181,7 +181,8 @@ class PoseGraph(eqx.Module):
         """
         shift = lie.translation(jax.lax.stop_gradient(self.T_i_j))
         length, valid = jnp.linalg.norm(shift, axis=-1), self.weight > 0
-        low, high = (nearest_rank(length, valid, q) for q in (0.25, 0.75))
+        quarters = jnp.asarray([0.25, 0.75], length.dtype)
+        low, high = jax.vmap(lambda q: nearest_rank(length, valid, q))(quarters)
         middle = valid & (length >= low) & (length <= high)
         count = jnp.maximum(jnp.sum(middle), 1).astype(length.dtype)
         mean = jnp.sum(jnp.where(middle, length, 0)) / count
@@ -192,7 +193,7 @@ class PoseGraph(eqx.Module):
         """Which frames edges hold; padding is not held."""
         w = self.weight
         most = jnp.zeros((self.num_poses,), w.dtype)
-        return most.at[self.edges[:, 0]].max(w).at[self.edges[:, 1]].max(w) > 0
+        return most.at[self.edges.T.reshape(-1)].max(jnp.concatenate([w, w])) > 0
 
     @property
     def num_held(self) -> Float[Array, ""]:
@@ -221,7 +222,13 @@ class PoseGraph(eqx.Module):
             Of the rotation (about 2 angle^2) and of the translation (length^2); 0 where
             masked.
         """
-        gap = self.T_i_j - self.predicted(T_world_i)
+        return self.differences_from(self.predicted(T_world_i))
+
+    def differences_from(
+        self, T_i_j: Float[Array, "e D D"]
+    ) -> tuple[Float[Array, " e"], Float[Array, " e"]]:
+        """`differences` of poses that make T_i_j of the motions (`predicted`)."""
+        gap = self.T_i_j - T_i_j
         gap = jnp.where(self.mask[:, None, None], gap, 0)
         return (
             jnp.sum(lie.rotation(gap) ** 2, axis=(-2, -1)),

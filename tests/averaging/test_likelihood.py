@@ -8,7 +8,8 @@ from scipy.special import logsumexp
 
 import jaxreg as jr
 from jaxreg import Status
-from jaxreg.averaging import MotionAveraging, average, likelihood
+from jaxreg.averaging import MotionAveraging, average
+from jaxreg.averaging.likelihood import Likelihood, least_after_fitting
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import (
     folding_graph,
@@ -19,8 +20,8 @@ from tests.averaging.graphs import (
 
 
 N, H = 10, 25
-log_evidence = eqx.filter_jit(likelihood.log_evidence)
-explained = eqx.filter_jit(likelihood.explained)
+log_evidence = eqx.filter_jit(lambda graph, T: Likelihood.of(graph).log_evidence(T))
+explained = eqx.filter_jit(lambda graph, T: Likelihood.of(graph).explained(T))
 
 
 def single(edges, T, num: int, **kwargs) -> PoseGraph:
@@ -154,13 +155,13 @@ def test_the_likeliest_deviation_and_the_odds_are_those_of_right_edges():
 def test_of_the_agreed_edges_those_of_a_tree_do_not_count():
     X, edges, T, bad = random_graph(32, 200, 0.3, 0)
     graph, true = single(edges, T, 32), jnp.asarray(X, jnp.float32)
-    share = likelihood.agreed_share(graph, true)
+    share = Likelihood.of(graph).agreed_share(true)
     assert share == pytest.approx((np.sum(~bad) - 31) / (200 - 31), abs=1e-6)
     found = explained(graph, true)
     # Terms r^2 / (2 s^2) of right edges have the variance D / 2; each is right nearly
     # for sure.
     chance = np.sqrt(0.8 / 2 * np.sum(~bad))
-    least = likelihood.least_after_fitting(found)
+    least = least_after_fitting(found)
     assert float(found.log_ratio - least) == pytest.approx(chance, rel=0.05)
 
 

@@ -18,7 +18,7 @@ from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.likelihood import (
     DEVIATIONS,
     Explained,
-    explained,
+    Likelihood,
     least_after_fitting,
 )
 from jaxreg.averaging.methods.motion_averaging import iterate_plain
@@ -44,6 +44,7 @@ _SETTLING, _GOING_ON, _DONE = len(DEVIATIONS), len(DEVIATIONS) + 1, len(DEVIATIO
 
 def annealed(
     graph: PoseGraph,
+    likelihood: Likelihood,
     T_start: Float[Array, "v D D"],
     max_steps: int,
     tolerance: Array | float,
@@ -56,9 +57,9 @@ def annealed(
 
     Gradients: implicit at the fixed point; widths are followed where they settled.
     """
-    fixed, T_start = jax.lax.stop_gradient((graph, T_start))
-    T, found = better_start(fixed, T_start, fixed)
-    width = first_width(fixed, T)
+    fixed, T_start = likelihood.graph, jax.lax.stop_gradient(T_start)
+    T, found = better_start(likelihood, T_start, fixed)
+    width = first_width(likelihood, T)
 
     def descend(before: _Descended) -> _Descended:
         opening, settling = before.stage < _SETTLING, before.stage == _SETTLING
@@ -67,13 +68,13 @@ def annealed(
             fixed,
             jnp.where(opening, T, before.end.T_world_i),
             begin,
-            width_rule(fixed.length_scale, begin, settling),
+            width_rule(likelihood.scale, begin, settling),
             gaussian_trust,
             gauss_newton_step,
             max_steps=max_steps,
             tolerance=jnp.where(opening, _NEARLY, tolerance),
         )
-        return before.followed_by(end, explained(fixed, end.T_world_i))
+        return before.followed_by(end, likelihood.explained(end.T_world_i))
 
     start = _Descended(
         stage=jnp.asarray(0, jnp.int32),
@@ -82,7 +83,7 @@ def annealed(
     )
     # Not on the driver: what it would carry is a number and whole ends of it.
     end = control.while_loop(lambda x: x.stage < _DONE, descend, start).end
-    followed = eqx.Partial(followed_width, fixed.length_scale)
+    followed = eqx.Partial(followed_width, likelihood.scale)
     return gauss_newton_gradients(graph, end, gaussian_trust, followed)
 
 
@@ -134,7 +135,7 @@ def _nothing_yet(graph: PoseGraph, T: Array, width: Array, max_steps: int) -> It
 
 
 def better_start(
-    graph: PoseGraph,
+    likelihood: Likelihood,
     T_start: Float[Array, "v D D"],
     near: PoseGraph,
 ) -> tuple[Float[Array, "v D D"], Explained]:
@@ -146,19 +147,21 @@ def better_start(
     """
     plain = iterate_plain(near, T_start, RootRows(), max_steps=5, tolerance=1e-2)
     both = jnp.stack([T_start, plain.T_world_i])
-    found = jax.lax.map(lambda T: explained(graph, T), both)
+    found = jax.lax.map(likelihood.explained, both)
     best = jnp.where(found.log_ratio[1] > found.log_ratio[0], 1, 0)
     return both[best], jax.tree.map(lambda x: x[best], found)
 
 
-def or_start(graph: PoseGraph, end: Iterated, T_start: Array) -> AveragingSolution:
+def or_start(
+    graph: PoseGraph, likelihood: Likelihood, end: Iterated, T_start: Array
+) -> AveragingSolution:
     """The solution; the start where nothing agrees at the end.
 
     A wide kernel then blurs the start's tree. Trust is the probability that an edge is
     right if the start is.
     """
-    fixed, both = jax.lax.stop_gradient((graph, jnp.stack([end.T_world_i, T_start])))
-    found = jax.lax.map(lambda T: explained(fixed, T, alone=True), both)
+    both = jax.lax.stop_gradient(jnp.stack([end.T_world_i, T_start]))
+    found = jax.lax.map(lambda T: likelihood.explained(T, alone=True), both)
     nothing = found.log_ratio[0] <= 0
     right = jax.nn.sigmoid(found.log_odds[1])
     end = end._replace(
@@ -166,4 +169,4 @@ def or_start(graph: PoseGraph, end: Iterated, T_start: Array) -> AveragingSoluti
         trust=jnp.where(nothing, right, end.trust),
     )
     evidence = jnp.where(nothing, found.log_ratio[1], found.log_ratio[0])
-    return solution_of(graph, end, evidence)
+    return solution_of(graph, end, likelihood, evidence)

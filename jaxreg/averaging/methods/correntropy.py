@@ -15,6 +15,7 @@ from jaxreg._core.checks import check_counts, check_not_negative, check_parts
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
+from jaxreg.averaging.likelihood import Likelihood
 from jaxreg.averaging.methods.annealed import annealed, better_start, or_start
 from jaxreg.averaging.methods.graduated import graduated
 from jaxreg.averaging.start.closures import without_doubtful_closures
@@ -78,21 +79,23 @@ class Correntropy(AbstractAverager):
     def _small(
         self, graph: PoseGraph, T_start: Float[Array, "v D D"]
     ) -> AveragingSolution:
-        end = annealed(graph, T_start, self.max_steps, self.tolerance)
-        return or_start(graph, end, T_start)
+        likelihood = Likelihood.of(graph)
+        end = annealed(graph, likelihood, T_start, self.max_steps, self.tolerance)
+        return or_start(graph, likelihood, end, T_start)
 
     @kept_program
     def _large(
         self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
     ) -> AveragingSolution:
         near = without_doubtful_closures(jax.lax.stop_gradient(graph))
+        likelihood = Likelihood.of(graph)
         if init is None:
             T_start = starting_poses(self.initialiser, near, None, key)
-            better, _ = better_start(graph, T_start, near)
+            better, _ = better_start(likelihood, T_start, near)
             starts = [better, along_frames(graph)]
         else:
             # A start of the caller's may be far off: plain steps that leave out what
             # pulls against them would bend it for good.
-            starts = [better_start(graph, init, graph)[0]]
-        end = graduated(graph, near, jnp.stack(starts), self.max_steps)
-        return solution_of(graph, end)
+            starts = [better_start(likelihood, init, graph)[0]]
+        end = graduated(graph, likelihood, near, jnp.stack(starts), self.max_steps)
+        return solution_of(graph, end, likelihood)

@@ -18,12 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.loop import AbstractIteration, iterate
 from jaxreg._core.quantile import nearest_rank
 from jaxreg.averaging.base import AveragingSolution
-from jaxreg.averaging.likelihood import (
-    SETTLED,
-    agreed_share,
-    explained,
-    squared_errors,
-)
+from jaxreg.averaging.likelihood import SETTLED, Likelihood, squared_errors
 from jaxreg.averaging.measures import weighted_mean
 from jaxreg.averaging.steps.edge_errors import LogError
 from jaxreg.averaging.steps.edge_problem import Problem, robust_problem
@@ -57,6 +52,7 @@ _LEFT = 1e-6
 
 def graduated(
     graph: PoseGraph,
+    likelihood: Likelihood,
     near: PoseGraph,
     starts: Float[Array, "s v D D"],
     max_steps: int,
@@ -71,9 +67,10 @@ def graduated(
 
     Gradients: implicit at the fixed point, widths are cut.
     """
-    fixed, near, starts = jax.lax.stop_gradient((graph, near, starts))
+    fixed = likelihood.graph
+    near, starts = jax.lax.stop_gradient((near, starts))
     counted = near.weight / jnp.where(fixed.weight > 0, fixed.weight, 1)
-    attempts = _Attempts(_Narrowing(fixed, counted, max_steps), starts)
+    attempts = _Attempts(_Narrowing(likelihood, counted, max_steps), starts)
     begin = attempts.init(starts[0])
     end = iterate(attempts, begin, max_steps=len(starts) + 1).state.end
     trust_of = eqx.Partial(kernel_trust, end.parts, end.width)
@@ -142,9 +139,14 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
     share that edges have before the end.
     """
 
-    graph: PoseGraph
+    likelihood: Likelihood
     counted: Float[Array, " e"]
     max_steps: int  # of a minimisation
+
+    @property
+    def graph(self) -> PoseGraph:
+        """The motions."""
+        return self.likelihood.graph
 
     @property
     def most(self) -> int:
@@ -191,7 +193,7 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
         new = minimise(now, s.found.T, self.max_steps, least, s.found.cycle)
         squares = now.squares(new.T)
         trust = now.trust(squares)
-        change = pose_change(graph, graph.length_scale, s.found.T, new.T)
+        change = pose_change(graph, self.likelihood.scale, s.found.T, new.T)
         trusted = weighted_mean(trust, graph.weight)
         wanted = _DEVIATIONS * self._deviation(squares, trust, width)
         next_width = jnp.clip(wanted, width / 2, width)
@@ -226,7 +228,8 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
 
     def _open(self, T: Array) -> Bool[Array, " e"]:
         """Edges that do not hold exactly."""
-        sq = squared_errors(self.graph, T)
+        scale = self.likelihood.scale
+        sq = squared_errors(self.graph, self.graph.predicted(T), scale)
         eps = 1e-4 if sq.dtype == jnp.float32 else 1e-8
         return (self.graph.weight > 0) & (sq > eps**2)
 
@@ -242,11 +245,12 @@ class _Narrowing(AbstractIteration[tuple[Array, Array], _State]):
 
         Among those inside the kernel that do not hold exactly.
         """
-        middle = middle_variances(self.graph, T, self._open(T) & (trust > 0.5))
+        of, graph = self._open(T) & (trust > 0.5), self.graph
+        middle = middle_variances(graph.differences(T), of, graph.dim)
         floor = 64 * jnp.finfo(middle.dtype).eps
-        floor = floor * jnp.stack([self.graph.length_scale, jnp.ones_like(middle[1])])
-        count, scale = self._count(trust), self.graph.length_scale
-        variance = spared_variances(self.graph, middle, count, scale)
+        count, scale = self._count(trust), self.likelihood.scale
+        floor = floor * jnp.stack([scale, jnp.ones_like(scale)])
+        variance = spared_variances(graph, middle, count, scale)
         return jnp.maximum(jnp.sqrt(variance), floor)
 
     def _spare_factor(self, trust: Array) -> Float[Array, ""]:
@@ -300,7 +304,7 @@ class _Attempts(AbstractIteration[Array, _Best]):
         begin = narrowing.init((T_start, every))
         end = iterate(narrowing, begin, max_steps=narrowing.most).state
         end = _without_cycle(end)
-        score = explained(graph, end.found.T).log_ratio
+        score = narrowing.likelihood.explained(end.found.T).log_ratio
         steps = b.end.found.step + end.found.step
         better = score > b.score
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, b.end)
@@ -310,5 +314,5 @@ class _Attempts(AbstractIteration[Array, _Best]):
             end=best._replace(found=best.found._replace(step=steps)),
             score=jnp.maximum(score, b.score),
             num_steps=b.num_steps + 1,
-            settled=agreed_share(trusted, end.found.T) > SETTLED,
+            settled=Likelihood.of(trusted).agreed_share(end.found.T) > SETTLED,
         )

@@ -18,7 +18,7 @@ from jaxreg.averaging.base import (
     of_start,
     solution,
 )
-from jaxreg.averaging.likelihood import SETTLED, agreed_share, explained
+from jaxreg.averaging.likelihood import SETTLED, Explained, Likelihood
 from jaxreg.averaging.start.cycles import edge_log_odds, judged
 from jaxreg.averaging.start.settle import settled
 from jaxreg.graph import trees
@@ -98,7 +98,7 @@ class _Best(NamedTuple):
     """The likeliest poses so far."""
 
     T: Float[Array, "v D D"]
-    log_ratio: Float[Array, ""]
+    found: Explained
     odds: Float[Array, "s e"]
     scale: Int[Array, ""]  # whose odds the first of them came from
     settled: Bool[Array, ""]
@@ -125,11 +125,11 @@ class _Search(AbstractIteration[Key | None, _Best]):
         weights = jnp.concatenate([odds, graph.weight[None]])
         T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(weights)
         T = jnp.concatenate([T, _shortest(graph, odds)[None]])
-        best, ratio = _likeliest(graph, T)
+        best, found = _likeliest(Likelihood.of(graph), T)
         none = jnp.asarray(0, jnp.int32)
         return _Best(
             T=T[best],
-            log_ratio=ratio,
+            found=found,
             odds=odds,
             scale=jnp.minimum(best, len(odds) - 1),
             settled=_is_settled(graph, odds, T[best]),
@@ -150,22 +150,28 @@ class _Search(AbstractIteration[Key | None, _Best]):
         From cold ones, which stay near the best poses, to hot ones.
         """
         graph, best, odds = self.graph, state, state.odds
+        likelihood = Likelihood.of(graph)
         key, now = jax.random.split(best.key)
         heat = jnp.geomspace(*_HEAT, self.hypotheses, dtype=odds.dtype)[:, None]
         noise = _noise(now, graph.num_edges, self.hypotheses, odds.dtype)
         each = odds[jnp.arange(self.hypotheses) % odds.shape[0]]
         each = jnp.exp(heat * noise[0]) * each + 2 * heat * noise[1]
         # What contradicts the best poses loses nothing: chains of them drift.
-        each = each + jax.nn.softplus(explained(graph, best.T).log_odds)[None]
+        each = each + jax.nn.softplus(best.found.log_odds)[None]
         T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(each)
         T = jnp.concatenate([best.T[None], T])
         if graph.num_poses <= DENSE_LIMIT:
-            T = jax.vmap(lambda T: settled(graph, T))(T)
-        found, ratio = _likeliest(graph, T)
-        better = ratio > best.log_ratio
+            T = jax.vmap(lambda T: settled(likelihood, T))(T)
+        likeliest, found = _likeliest(likelihood, T)
+        better = found.log_ratio > best.found.log_ratio
+        T_best, found = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old),
+            (T[likeliest], found),
+            (best.T, best.found),
+        )
         return best._replace(
-            T=jnp.where(better, T[found], best.T),
-            log_ratio=jnp.maximum(ratio, best.log_ratio),
+            T=T_best,
+            found=found,
             idle=jnp.where(better, 0, best.idle + 1),
             num_steps=best.num_steps + 1,
             key=key,
@@ -193,7 +199,7 @@ def _by_trees(graph: PoseGraph) -> Float[Array, "v D D"]:
             trees.maximum_spanning_tree(*args).T_world_i,
         ]
     )
-    return T[_likeliest(graph, T)[0]]
+    return T[_likeliest(Likelihood.of(graph), T)[0]]
 
 
 @kept_program
@@ -212,13 +218,15 @@ def _with_trust(graph: PoseGraph, best: _Best) -> AveragingSolution:
     return solution(graph, best.T, edge_weight=trust, num_steps=best.num_steps)
 
 
-def _likeliest(graph: PoseGraph, T: Float[Array, "m v D D"]) -> tuple[Array, Array]:
-    """Which of some poses, and their log likelihood ratio."""
+def _likeliest(
+    likelihood: Likelihood, T: Float[Array, "m v D D"]
+) -> tuple[Int[Array, ""], Explained]:
+    """Which of some poses, and how they explain the motions."""
     # Groups of one size: what is left over would be a program of its own.
     group = max(k for k in range(1, _GROUP + 1) if len(T) % k == 0)
-    ratio = jax.lax.map(lambda T: explained(graph, T).log_ratio, T, batch_size=group)
-    best = jnp.argmax(ratio)
-    return best, ratio[best]
+    found = jax.lax.map(likelihood.explained, T, batch_size=group)
+    best = jnp.argmax(found.log_ratio)
+    return best, jax.tree.map(lambda x: x[best], found)
 
 
 def _forest(graph: PoseGraph, odds: Array) -> trees.Forest:
@@ -252,7 +260,7 @@ def _is_settled(graph: PoseGraph, odds: Array, T: Array) -> Array:
         component = trees.components(graph.edges, trusted, graph.num_poses)
         reached = jnp.all((component == 0) | ~placed)
         part = eqx.tree_at(lambda g: g.weight, graph, trusted)
-        return scale + 1, reached & (agreed_share(part, T) > SETTLED)
+        return scale + 1, reached & (Likelihood.of(part).agreed_share(T) > SETTLED)
 
     return control.while_loop(
         lambda asked: ~asked[1] & (asked[0] < len(odds)),

@@ -5,28 +5,28 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg._core import control
-from jaxreg.averaging.likelihood import explained
+from jaxreg.averaging.likelihood import Likelihood
 from jaxreg.averaging.start.cycles import ROUNDS
 from jaxreg.averaging.steps.kernel_width import KERNEL_DEVIATIONS, gaussian_trust
 from jaxreg.geometry import lie
-from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.laplacian import laplacian
 from jaxreg.linear.operator import divergence
 from jaxreg.linear.small import product
 
 
 def settled(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+    likelihood: Likelihood, T_world_i: Float[Array, "v D D"]
 ) -> Float[Array, "v D D"]:
     """The poses after a few steps of averaging the motions that agree with them.
 
     A chain of motions drifts; what agrees with it shows only then. The kernel follows
     the likeliest deviation. Dense over frames.
     """
-    num, scale = graph.num_poses, graph.length_scale
+    graph, scale = likelihood.graph, likelihood.scale
+    num = graph.num_poses
 
     def step(_: Array, T: Array) -> Array:
-        w = KERNEL_DEVIATIONS * explained(graph, T).deviation
+        w = KERNEL_DEVIATIONS * likelihood.explained(T).deviation
         trust = graph.weight * gaussian_trust(graph, T, jnp.stack([w * scale, w]))
         top = jnp.max(trust)
         trust = trust / jnp.where(top > 0, top, 1)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core import loop
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging.base import AveragingSolution, solution
+from jaxreg.averaging.likelihood import Likelihood
 from jaxreg.averaging.measures import weighted_mean
 from jaxreg.averaging.steps.rows import AbstractRows
 from jaxreg.averaging.trace import AveragingTrace, no_rows, with_row
@@ -69,12 +70,16 @@ def going_on(first: Iterated, then: Iterated) -> Iterated:
 
 
 def solution_of(
-    graph: PoseGraph, end: Iterated, evidence: Scalar | None = None
+    graph: PoseGraph,
+    end: Iterated,
+    likelihood: Likelihood | None = None,
+    evidence: Scalar | None = None,
 ) -> AveragingSolution:
     """The solution where the loop stopped; its `log_evidence` if that is known."""
     return solution(
         graph,
         end.T_world_i,
+        likelihood=likelihood,
         evidence=evidence,
         edge_weight=end.trust,
         converged=end.converged,

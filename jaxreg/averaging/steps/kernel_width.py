@@ -7,7 +7,7 @@ import scipy.special
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.quantile import nearest_rank
-from jaxreg.averaging.likelihood import explained
+from jaxreg.averaging.likelihood import Likelihood
 from jaxreg.averaging.steps.iterate import STILL, WidthOf
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.small import inverse
@@ -25,22 +25,25 @@ def gaussian_trust(
     graph: PoseGraph, T_world_i: Float[Array, "v D D"], width: Float[Array, "2"]
 ) -> Float[Array, " e"]:
     """G_sigma of the residual of each edge (Eq. 12); widths are (length, angle)."""
-    rotation, translation = graph.differences(T_world_i)
+    return _gaussian(graph.differences(T_world_i), width)
+
+
+def _gaussian(differences: tuple[Array, Array], width: Array) -> Array:
+    rotation, translation = differences
     sq = translation / width[0] ** 2 + rotation / (2 * width[1] ** 2)
     return jnp.exp(-sq / 2)
 
 
 def first_width(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"]
+    likelihood: Likelihood, T_world_i: Float[Array, "v D D"]
 ) -> Float[Array, "2"]:
     """A width that sees the right edges from the start, and few others.
 
     Three of the likeliest deviations, and half of the octave between those compared.
     """
-    width = (
-        KERNEL_DEVIATIONS * 2**0.5 * explained(graph, T_world_i, alone=True).deviation
-    )
-    return jnp.stack([width * graph.length_scale, width])
+    deviation = likelihood.explained(T_world_i, alone=True).deviation
+    width = KERNEL_DEVIATIONS * 2**0.5 * deviation
+    return jnp.stack([width * likelihood.scale, width])
 
 
 def width_rule(
@@ -96,8 +99,8 @@ def _three_deviations(
     graph: PoseGraph, T_world_i: Array, width: Array, scale: Array
 ) -> Float[Array, "2"]:
     d = graph.dim
-    rotation, translation = graph.differences(T_world_i)
-    trust = gaussian_trust(graph, T_world_i, width)
+    differences = rotation, translation = graph.differences(T_world_i)
+    trust = _gaussian(differences, width)
     w = graph.weight * trust
     total = jnp.maximum(jnp.sum(w), jnp.finfo(w.dtype).tiny)
     dof = d * (d - 1) // 2
@@ -105,7 +108,7 @@ def _three_deviations(
     v = v / total
     # Noise of many scales would draw the mean to the finest; the median stands.
     inside = (graph.weight > 0) & (trust > 0.5)
-    middle = middle_variances(graph, T_world_i, inside)
+    middle = middle_variances(differences, inside, d)
     count = jnp.sum(jnp.where(graph.weight > 0, trust, 0))
     variance = jnp.maximum(variance_inside(v, width), middle)
     variance = spared_variances(graph, variance, count, scale)
@@ -125,17 +128,22 @@ def variance_inside(mean: Array, width: Array) -> Array:
 
 
 def middle_variances(
-    graph: PoseGraph, T_world_i: Float[Array, "v D D"], of: Bool[Array, " e"]
+    differences: tuple[Float[Array, " e"], Float[Array, " e"]],
+    of: Bool[Array, " e"],
+    d: int,
 ) -> Float[Array, "2"]:
-    """Of one component of the translation and of the rotation, by the middle edges."""
-    rotation, translation = graph.differences(T_world_i)
-    d = graph.dim
-    return jnp.stack(
-        [
-            nearest_rank(translation, of, 0.5) / chi2_median(d),
-            nearest_rank(rotation, of, 0.5) / (2 * chi2_median(d * (d - 1) // 2)),
-        ]
-    )
+    """Of one component of the translation and of the rotation, by the middle edges.
+
+    Args:
+        differences: `graph.differences` of the poses.
+        of: which edges.
+        d: the dimension of space.
+    """
+    rotation, translation = differences
+    both = jnp.stack([translation, rotation])
+    middle = jax.vmap(lambda x: nearest_rank(x, of, 0.5))(both)
+    usual = [chi2_median(d), 2 * chi2_median(d * (d - 1) // 2)]
+    return middle / jnp.asarray(usual, middle.dtype)
 
 
 def chi2_median(dof: int) -> float:
