@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Key, Motions
 from jaxreg.geometry.nearest_rotation import nearest_rotation
-from jaxreg.linear.small import product
+from jaxreg.linear.small import cross, product
 
 
 P = ParamSpec("P")
@@ -155,7 +155,7 @@ def hat(w: Float[Array, "*b r"]) -> Float[Array, "*b d d"]:
 def _cross(w: Float[Array, "*b r"], v: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
     """The velocity of a point at v that turns with w."""
     if v.shape[-1] == 3:
-        return jnp.cross(w, v)
+        return cross(w, v)
     return w * jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
 
 
@@ -205,8 +205,13 @@ def compose(
     rotation = jnp.broadcast_to(rotation, (*batch, d, d))
     translation = jnp.broadcast_to(translation, (*batch, d))
     top = jnp.concatenate([rotation, translation[..., None]], axis=-1)
-    last = jnp.zeros((*batch, 1, d + 1), dtype=top.dtype).at[..., d].set(1)
-    return jnp.concatenate([top, last], axis=-2)
+    return _with_last_row(top)
+
+
+def _with_last_row(top: Float[Array, "*b d D"]) -> Motions:
+    *batch, d, _ = top.shape
+    last = jnp.asarray([[0.0] * d + [1.0]], top.dtype)
+    return jnp.concatenate([top, jnp.broadcast_to(last, (*batch, 1, d + 1))], axis=-2)
 
 
 def rotation(T: Motions) -> Float[Array, "*b d d"]:
@@ -229,7 +234,9 @@ def between(
     T_a_b: Float[Array, "*#b D D"], T_a_c: Float[Array, "*#b D D"]
 ) -> Float[Array, "*b D D"]:
     """`T_b_c`, the inverse of the one times the other."""
-    return product(inverse(T_a_b), T_a_c)
+    shift = translation(T_a_c) - translation(T_a_b)
+    moved = jnp.concatenate([rotation(T_a_c), shift[..., None]], axis=-1)
+    return _with_last_row(product(jnp.swapaxes(rotation(T_a_b), -1, -2), moved))
 
 
 def act(T: Float[Array, "D D"], points: Float[Array, "*n d"]) -> Float[Array, "*n d"]:

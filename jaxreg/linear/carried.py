@@ -8,13 +8,15 @@ same number, and single precision tells them apart no more.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxreg.linear.small import cross
+
 
 def carried(x: Float[Array, "*b k c"], shift: Float[Array, "*b d"]) -> Array:
     """The velocities C x at points `shift` further, each column by itself."""
     d = shift.shape[-1]
     lever, turn = shift[..., None], x[..., d:, :]
     if d == 3:
-        moved = jnp.cross(turn, lever, axis=-2)
+        moved = cross(turn, lever, axis=-2)
     else:
         moved = turn * jnp.concatenate([-lever[..., 1:, :], lever[..., :1, :]], axis=-2)
     return jnp.concatenate([x[..., :d, :] + moved, turn], axis=-2)
@@ -25,7 +27,7 @@ def carried_back(force: Float[Array, "*b k c"], shift: Float[Array, "*b d"]) -> 
     d = shift.shape[-1]
     lever, push = shift[..., None], force[..., :d, :]
     if d == 3:
-        torque = jnp.cross(lever, push, axis=-2)
+        torque = cross(lever, push, axis=-2)
     else:
         torque = lever[..., :1, :] * push[..., 1:, :]
         torque = torque - lever[..., 1:, :] * push[..., :1, :]

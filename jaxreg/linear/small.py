@@ -8,6 +8,8 @@ that do not depend on each other can wait for each other for ever.
 Reference: Golub, Van Loan, Matrix Computations: 8.5 (Jacobi), 8.6.3 (one-sided Jacobi).
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -26,8 +28,22 @@ def product(
     """
     rank = max(A.ndim, B.ndim)
     A, B = (jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in (A, B))
-    terms = [A[..., :, k, None] * B[..., None, k, :] for k in range(A.shape[-1])]
+    columns, rows = (jnp.split(x, A.shape[-1], axis) for x, axis in ((A, -1), (B, -2)))
+    terms = [a * b for a, b in zip(columns, rows, strict=True)]
     return sum(terms[1:], terms[0])
+
+
+def cross(a: Array, b: Array, axis: int = -1) -> Array:
+    """Cross products of 3-vectors along an axis, in a third of the operations of JAX's.
+
+    Computed in the order z, x, y and then moved on by one.
+    """
+
+    def next_one(x: Array) -> Array:
+        first, others = jnp.split(x, [1], axis)
+        return jnp.concatenate([others, first], axis)
+
+    return next_one(a * next_one(b) - next_one(a) * b)
 
 
 def after(x: Array, earlier: Array) -> Array:
@@ -80,7 +96,7 @@ def solve_semidefinite(
     """
     k = b.shape[-1]
     L, pivots = _factors(A)
-    x = [b[..., i] for i in range(k)]
+    x = list(jnp.unstack(b, axis=-1))
     for i in range(k):
         x[i] = x[i] - sum(L[i][m] * x[m] for m in range(i))
     x = [x[i] * pivots[i] for i in range(k)]
@@ -139,7 +155,7 @@ def root_semidefinite(
     """
     k = b.shape[-1]
     L, pivots = _factors(A)
-    x = [b[..., i] for i in range(k)]
+    x = list(jnp.unstack(b, axis=-1))
     for i in range(k):
         x[i] = x[i] - sum(L[i][m] * x[m] for m in range(i))
     shrink = [jnp.sqrt(p) for p in pivots]
@@ -154,23 +170,22 @@ def root_semidefinite(
 
 def _factors(A: Array) -> tuple[list[list[Array]], list[Array]]:
     """Rows of L below its unit diagonal, and the inverse pivots; zero for free ones."""
-    k = A.shape[-1]
-    largest = jnp.max(jnp.diagonal(A, axis1=-2, axis2=-1), axis=-1)
+    k, entries = A.shape[-1], _entries(A)
+    largest = functools.reduce(jnp.maximum, (entries[i][i] for i in range(k)))
     least = k * jnp.finfo(A.dtype).eps * largest
     L: list[list[Array]] = [[] for _ in range(k)]
-    pivot, inverted = [], []
+    LD: list[list[Array]] = [[] for _ in range(k)]
+    inverted: list[Array] = []
     for i in range(k):
-        for j in range(i):
-            entry = A[..., i, j]
+        for j in range(i + 1):
+            entry = entries[i][j]
             for m in range(j):
-                entry = entry - L[i][m] * L[j][m] * pivot[m]
-            L[i].append(entry * inverted[j])
-        entry = A[..., i, i]
-        for m in range(i):
-            entry = entry - L[i][m] * L[i][m] * pivot[m]
-        fixed = entry > least
-        pivot.append(entry)
-        inverted.append(jnp.where(fixed, 1 / jnp.where(fixed, entry, 1), 0))
+                entry = entry - LD[i][m] * L[j][m]
+            LD[i].append(entry)
+            if j < i:
+                L[i].append(entry * inverted[j])
+        fixed = LD[i][i] > least
+        inverted.append(jnp.where(fixed, 1 / jnp.where(fixed, LD[i][i], 1), 0))
     return L, inverted
 
 
@@ -294,8 +309,7 @@ def _padded(A: Array, size: int) -> Array:
 
 
 def _entries(A: Array) -> list[list[Array]]:
-    n = A.shape[-1]
-    return [[A[..., i, j] for j in range(n)] for i in range(n)]
+    return [list(jnp.unstack(row, axis=-1)) for row in jnp.unstack(A, axis=-2)]
 
 
 def _stacked(rows: list[list[Array]]) -> Array:
