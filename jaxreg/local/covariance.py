@@ -1,5 +1,7 @@
 """How far a registered pose may err: a sandwich taken around it, not at it."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -41,6 +43,8 @@ def pose_covariance(
     T_target_source: Motion,
     found: Match,
     width: Float[Array, ""],
+    weight: Float[Array, " n"],
+    H: Float[Array, "k k"],
 ) -> Float[Array, "k k"]:
     """Of the error of a pose that solves sum_i w_i J_i^T r_i = 0, in its tangent.
 
@@ -79,20 +83,24 @@ def pose_covariance(
         T_target_source: the pose.
         found: the match there.
         width: kernel width.
+        weight: of each match there.
+        H: the Gauss-Newton matrix there.
 
     Gradients: of no use, as the matches jump; `Curvature` cuts them.
     """
-    T, weight = T_target_source, optimiser.weights(found, width)
-    H, _ = optimiser.residual.normal_equations(found, weight)
+    T, white = T_target_source, _whitening(H)
     pulls = optimiser.residual.descents(found) * weight[None]
     reach, cell = _reach(found, weight, width), _cells(problem)
     at_root = _summed(pulls, cell[found.row])
 
-    def around(
-        away: Float[Array, "r k"], number: Array
-    ) -> tuple[Float[Array, "r k"], tuple[Array, Array, Array]]:
-        """A there, B there, and B of the same points at the root, which comes first."""
-        T_there = turn_and_shift(T, jnp.where(number > 0, away[number - 1], 0))
+    def around(number: Array, state: tuple[_Sums, Array]) -> tuple[_Sums, Array]:
+        """The sums with those of one more pose, and the inverse of A at the root.
+
+        The root comes first, and the mean of those around it last.
+        """
+        sums, inverse = state
+        away = _led(at_root, inverse)[number - 1]
+        T_there = turn_and_shift(T, jnp.where(number > 0, away, 0))
         few, some = _some(problem, _FEW, number % _AROUND)
         A, there, row = _told(optimiser, few, T_there, reach, width)
         asked, num = jnp.sum(few.source_mask), jnp.sum(problem.source_mask)
@@ -100,22 +108,31 @@ def pose_covariance(
         here = jnp.where(few.source_mask, pulls[:, some], 0)
         there = _scatter(_summed(there, cell[row]))
         here = _scatter(_summed(here, cell[found.row[some]]))
-        away = control.cond(
-            number == 0,
-            lambda A: _led(at_root, inverse_within(A, H)),
-            lambda _: away,
-            A,
+        new = _Sums(A, there, here)
+        sums = jax.tree.map(lambda s, x: jnp.where(number > 1, s + x, x), sums, new)
+        inverse = control.cond(
+            (number == 0) | (number == _AROUND),
+            lambda A: _inverse(A / jnp.maximum(number, 1).astype(A.dtype), white),
+            lambda _: inverse,
+            sums.A,
         )
-        return away, (A, there, here)
+        return sums, inverse
 
-    start = jnp.zeros((_AROUND, len(H)), at_root.dtype)
-    _, found_there = control.scan(around, start, jnp.arange(1 + _AROUND))
-    A, there, here = (jnp.mean(x[1:], axis=0) for x in found_there)
-    inverse = inverse_within(A, H)
+    zero = jnp.zeros_like(H)
+    start = _Sums(zero, zero, zero), zero
+    (_, there, here), inverse = control.fori_loop(0, 1 + _AROUND, around, start)
     # Of all points as much as of those that were asked, in deviations of the pose.
-    asked = jnp.sum(here * inverse)
+    asked = jnp.sum(here * inverse) / _AROUND
     growth = jnp.sum(_scatter(at_root) * inverse) / jnp.where(asked > 0, asked, 1)
-    return full_matmul(inverse, full_matmul(growth * there, inverse))
+    return full_matmul(inverse, full_matmul(growth / _AROUND * there, inverse))
+
+
+class _Sums(NamedTuple):
+    """Over poses around the answer: A, B, and B of the same points at the answer."""
+
+    A: Float[Array, "k k"]
+    there: Float[Array, "k k"]
+    here: Float[Array, "k k"]
 
 
 def _led(
@@ -163,7 +180,7 @@ def answer(
     few, some = _some(problem, _PROBES)
     moved = match(_displaced(few, reach), T_target_source)
     pulls = optimiser.residual.descents(moved) * optimiser.weights(moved, width)[None]
-    A = _answer(pulls, match(few, T_target_source, row=found.row[some]), reach)
+    A = _answer(pulls, found.of_rows(some), reach)
     asked = jnp.sum(weight[some] * few.source_mask)
     return jnp.sum(weight) / jnp.where(asked > 0, asked, 1) * A
 
@@ -180,8 +197,7 @@ def _told(
     found = match(few.beside(_displaced(probes, reach)), T_target_source, width=width)
     weight = optimiser.weights(found, width)
     pulls = optimiser.residual.descents(found) * weight[None]
-    at_rest = match(probes, T_target_source, row=found.row[some])
-    A = _answer(pulls[:, n:], at_rest, reach)
+    A = _answer(pulls[:, n:], found.of_rows(some), reach)
     # As if all points had been asked, by the share of the weight of those that were.
     asked = jnp.sum(weight[some] * probes.source_mask)
     A = jnp.sum(weight[:n]) / jnp.where(asked > 0, asked, 1) * A
@@ -244,12 +260,21 @@ def inverse_within(
     A: Float[Array, "k k"], H: Float[Array, "k k"]
 ) -> Float[Array, "k k"]:
     """A^-1 in the directions that H holds, with A from 0.01 to 1 times H."""
+    return _inverse(A, _whitening(H))
+
+
+def _whitening(H: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    """W with W^T H W = I in the directions that H holds; zero in the others."""
     diagonal = jnp.diagonal(H)
     unit = jnp.where(diagonal > 0, lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1)), 0)
     value, vector = eigh(H * unit[:, None] * unit[None])
     held = value > len(H) * jnp.finfo(H.dtype).eps * value[-1]
     root = jnp.where(held, lax.rsqrt(jnp.where(held, value, 1)), 0)
-    white = unit[:, None] * vector * root[None]  # white.T H white = I
+    return unit[:, None] * vector * root[None]
+
+
+def _inverse(A: Float[Array, "k k"], white: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    """That of `inverse_within`, given the `_whitening` of H."""
     share = full_matmul(white.T, full_matmul(A, white))
     value, vector = eigh(share)
     white = full_matmul(white, vector)

@@ -52,7 +52,7 @@ class Curvature(eqx.Module):
         weight = optimiser.weights(found, width)
         residual = optimiser.residual
         H, b = residual.normal_equations(found, weight)
-        frozen = optimiser, problem, T_target_source, found, width
+        frozen = optimiser, problem, T_target_source, found, width, weight, H
         covariance = pose_covariance(*lax.stop_gradient(frozen))
         return cls(H, b, residual.energy(found, weight), covariance)
 

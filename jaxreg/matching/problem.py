@@ -143,6 +143,19 @@ class Match(eqx.Module):
         """Signed distance to the target's tangent plane (line in 2D)."""
         return inner(self.normal, self.residual)
 
+    def of_rows(self, rows: Int[Array, " r"]) -> "Match":
+        """The match of some of the source points."""
+        return dataclasses.replace(
+            self,
+            source=self.source[:, rows],
+            residual=self.residual[:, rows],
+            normal=self.normal[:, rows],
+            source_normal=self.source_normal[:, rows],
+            agreement=self.agreement[rows],
+            row=self.row[rows],
+            mask=self.mask[rows],
+        )
+
     def within(self, distance: Scalar) -> "Match":
         """With the pairs that are farther apart masked."""
         near = self.sq_residual <= distance**2
