@@ -1,9 +1,7 @@
 """The layout is the architecture: imports point downward."""
 
-import ast
 import subprocess
 import sys
-from pathlib import Path
 
 from architecture import FLOOR, PACKAGE, arrows, climbs, module_of, room_of
 
@@ -52,22 +50,3 @@ def _said(code: str) -> str:
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent
     )
     return done.stderr.strip()
-
-
-def test_jaxlie_lives_behind_one_module():
-    users = [
-        path.relative_to(PACKAGE).as_posix()
-        for path in PACKAGE.rglob("*.py")
-        if "jaxlie" in _top_imports(path)
-    ]
-    assert users == ["geometry/lie.py"]
-
-
-def _top_imports(path: Path) -> set[str]:
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module.split(".")[0])
-    return names

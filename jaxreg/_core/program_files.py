@@ -17,7 +17,7 @@ _HEAD = len(_MAGIC) + hashlib.sha256().digest_size
 _MOST_BYTES = 2**28
 # Whose objects can be part of a key: their code is that of a version, or of the package
 # itself, which is part of the key.
-_KNOWN = {"jaxreg", "jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxlie"}
+_KNOWN = {"jaxreg", "jax", "jaxlib", "equinox", "optimistix", "lineax"}
 _KNOWN |= {"numpy", "ml_dtypes", "builtins", "copyreg", "collections", "functools"}
 
 

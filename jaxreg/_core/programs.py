@@ -191,7 +191,7 @@ def _code() -> tuple[str, ...]:
     root = Path(__file__).parents[1]
     files = sorted(root.rglob("*.py"))
     code = digest(*(part for p in files for part in (str(p), p.read_bytes())))
-    libraries = ("jax", "jaxlib", "equinox", "jaxlie", "lineax", "optimistix", "numpy")
+    libraries = ("jax", "jaxlib", "equinox", "lineax", "optimistix", "numpy")
     versions = (metadata.version(name) for name in libraries)
     return code, platform.python_version(), *versions
 

@@ -62,11 +62,11 @@ def inverse(A: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     """
     n = A.shape[-1]
     if n == 2:
-        (a, b), (c, d) = _entries(A)
+        (a, b), (c, d) = entries(A)
         cofactors = [[d, -b], [-c, a]]
         determinant = a * d - b * c
     else:
-        x = _entries(A)
+        x = entries(A)
         # Entry (i, j) of the adjugate leaves out row j and column i.
         cofactors = [
             [
@@ -170,15 +170,15 @@ def root_semidefinite(
 
 def _factors(A: Array) -> tuple[list[list[Array]], list[Array]]:
     """Rows of L below its unit diagonal, and the inverse pivots; zero for free ones."""
-    k, entries = A.shape[-1], _entries(A)
-    largest = functools.reduce(jnp.maximum, (entries[i][i] for i in range(k)))
+    k, lower = A.shape[-1], entries(A)
+    largest = functools.reduce(jnp.maximum, (lower[i][i] for i in range(k)))
     least = k * jnp.finfo(A.dtype).eps * largest
     L: list[list[Array]] = [[] for _ in range(k)]
     LD: list[list[Array]] = [[] for _ in range(k)]
     inverted: list[Array] = []
     for i in range(k):
         for j in range(i + 1):
-            entry = entries[i][j]
+            entry = lower[i][j]
             for m in range(j):
                 entry = entry - LD[i][m] * L[j][m]
             LD[i].append(entry)
@@ -308,7 +308,8 @@ def _padded(A: Array, size: int) -> Array:
     return jnp.pad(A, pad)
 
 
-def _entries(A: Array) -> list[list[Array]]:
+def entries(A: Float[Array, "*b n n"]) -> list[list[Float[Array, "*b"]]]:
+    """The entries of small matrices, row by row."""
     return [list(jnp.unstack(row, axis=-1)) for row in jnp.unstack(A, axis=-2)]
 
 

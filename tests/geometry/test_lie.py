@@ -1,5 +1,6 @@
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -90,6 +91,28 @@ def test_rotation_angle_is_accurate_near_zero_and_pi(angle):
     R2 = np.array([[c, -s], [s, c]], np.float32)
     for R in (R2, R3):
         assert float(_angle(R)) == pytest.approx(angle, abs=2e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rotation_vectors_are_those_of_jaxlie(dtype):
+    rng, eps = np.random.default_rng(0), np.finfo(dtype).eps
+    axes = np.concatenate([rng.normal(size=(60, 3)), np.eye(3), -np.eye(3)])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = np.concatenate([[0, 1e-7, 1e-3, np.pi - 1e-3], np.linspace(0.1, 3.1, 9)])
+    with jax.enable_x64(dtype is np.float64):
+        turn = jax.jit(lambda R: (lie.rotation_log(R), jaxlie.SO3.from_matrix(R).log()))
+        for angle in angles:
+            R = Rotation.from_rotvec(angle * axes).as_matrix().astype(dtype)
+            found, theirs = turn(jnp.asarray(R))
+            assert found.dtype == dtype
+            # Their digits near zero and a half turn are fewer.
+            np.testing.assert_allclose(found, theirs, rtol=1e-4, atol=300 * eps)
+            np.testing.assert_allclose(found, angle * axes, rtol=0, atol=8 * eps)
+        half = Rotation.from_rotvec(np.pi * axes).as_matrix().astype(dtype)
+        again = lie.rotation_exp(lie.rotation_log(jnp.asarray(half)))
+        np.testing.assert_allclose(again, half, atol=16 * eps)
+        flat = jnp.asarray([[[0, 1], [-1, 0]]], dtype)
+        np.testing.assert_allclose(lie.rotation_log(flat), [[-np.pi / 2]], rtol=eps)
 
 
 def test_orthonormalise_gives_the_nearest_rotation():
