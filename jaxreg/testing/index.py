@@ -14,6 +14,8 @@ _M, _N = 300, 200
 _UNIT = 1024.0
 
 Build = Callable[..., AbstractIndex]
+#: What is found, and the reach, of targets, a mask, queries and a radius.
+Find = Callable[..., tuple[Neighbours, jax.Array]]
 
 
 def check_index(build: Build, *, recall: float = 1.0, k: int = 1) -> None:
@@ -36,14 +38,15 @@ def check_index(build: Build, *, recall: float = 1.0, k: int = 1) -> None:
     Raises:
         AssertionError: naming the promise that is broken.
     """
+    find, name = _finder(build), _name(build)
     for d in (2, 3):
         for dtype in (np.float32, np.float64):
             with jax.enable_x64(dtype is np.float64):
-                name = f"{_name(build)} in {d}D, {np.dtype(dtype).name}"
-                _promise_search(name, build, _clouds(d, dtype), recall)
-    name, clouds = _name(build), _clouds(3, np.float32)
-    _promise_transformations(name, build, clouds)
-    _promise_flags(name, build, clouds)
+                of = f"{name} in {d}D, {np.dtype(dtype).name}"
+                _promise_search(of, find, _clouds(d, dtype), recall)
+    clouds = _clouds(3, np.float32)
+    _promise_transformations(name, build, find, clouds)
+    _promise_flags(name, find, clouds)
     if k > 1:
         _promise_several(name, build, clouds, k)
 
@@ -71,8 +74,8 @@ def _distances(target: np.ndarray, mask: np.ndarray, queries: np.ndarray):
     return np.where(mask, np.linalg.norm(delta, axis=-1), np.inf)
 
 
-def _finder(build: Build, k: int = 1) -> Callable[..., tuple[Neighbours, jax.Array]]:
-    """Compiled: what is found, and the reach."""
+def _finder(build: Build, k: int = 1) -> Find:
+    """Compiled."""
 
     def find(target, mask, queries, radius=jnp.inf):
         index = build(target, mask)
@@ -81,9 +84,9 @@ def _finder(build: Build, k: int = 1) -> Callable[..., tuple[Neighbours, jax.Arr
     return jax.jit(find)
 
 
-def _promise_search(name: str, build: Build, clouds: tuple, recall: float) -> None:
+def _promise_search(name: str, find: Find, clouds: tuple, recall: float) -> None:
     target, mask, queries = clouds
-    found, reach = _finder(build)(target, mask, queries)
+    found, reach = find(target, mask, queries)
     row, valid = np.asarray(found.index), np.asarray(found.valid)
     promise_dtypes((found, reach), target.dtype, name)
     promise(row.shape == (_N,), f"{name}: {_N} queries have {row.shape} answers.")
@@ -105,13 +108,15 @@ def _promise_search(name: str, build: Build, clouds: tuple, recall: float) -> No
         share >= recall,
         f"{name}: {share:.3f} of the answers are the nearest; wanted {recall:.3f}.",
     )
-    units = _finder(build)(_UNIT * target, mask, _UNIT * queries)[0]
+    units = find(_UNIT * target, mask, _UNIT * queries)[0]
     if recall == 1 and np.isinf(reach):
         promise(units.index == row, f"{name}: another unit changes what is found.")
 
 
-def _promise_transformations(name: str, build: Build, clouds: tuple) -> None:
-    find, sets = _finder(build), [clouds, _clouds(3, np.float32, 1)]
+def _promise_transformations(
+    name: str, build: Build, find: Find, clouds: tuple
+) -> None:
+    sets = [clouds, _clouds(3, np.float32, 1)]
     batched, _ = jax.jit(jax.vmap(find))(*map(np.stack, zip(*sets, strict=True)))
     for lane, one in enumerate(sets):
         same = np.array_equal(batched.index[lane], find(*one)[0].index)
@@ -124,12 +129,17 @@ def _promise_transformations(name: str, build: Build, clouds: tuple) -> None:
         f"{name}: compiled and not do not find the same.",
     )
     columns = jnp.tile(queries, (40, 1)).T
-    some = jax.jit(lambda num: built.lookup(columns, num))(jnp.asarray(300))
+
+    def in_three_ways(num: jax.Array, coarse: jax.Array) -> tuple[jax.Array, ...]:
+        all_, some = built.lookup(columns), built.lookup(columns, num)
+        return all_, some, built.lookup(columns, coarse=coarse)
+
+    ways = jax.jit(in_three_ways)(jnp.asarray(300), jnp.asarray(True))
+    every, some, near = map(np.asarray, ways)
     promise(
-        np.array_equal(some[:300], built.lookup(columns)[:300]),
+        np.array_equal(some[:300], every[:300]),
         f"{name}: how many are answered changes the first.",
     )
-    near = built.lookup(columns, coarse=jnp.asarray(True))
     promise(mask[near], f"{name}: a coarse answer is a masked target.")
 
     def total(target: jax.Array, queries: jax.Array) -> jax.Array:
@@ -142,8 +152,8 @@ def _promise_transformations(name: str, build: Build, clouds: tuple) -> None:
     promise_equal((by_target, by_query), (wanted, delta), what, rtol=1e-4, atol=1e-5)
 
 
-def _promise_flags(name: str, build: Build, clouds: tuple) -> None:
-    find, (target, mask, queries) = _finder(build), clouds
+def _promise_flags(name: str, find: Find, clouds: tuple) -> None:
+    target, mask, queries = clouds
     expected = find(*clouds)[0]
     nothing = find(target, np.zeros_like(mask), queries)[0]
     promise(~nothing.valid, f"{name}: something is found where no target is valid.")
