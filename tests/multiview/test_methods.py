@@ -58,7 +58,10 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    "name",
+    ["of somebody else", pytest.param("MultiStart", marks=pytest.mark.slow)],
+)
 def test_any_registrar_reconstructs(name):
     sol = jr.reconstruct(SCANS, key=KEY, method=METHODS[name])
     assert np.all(sol.placed)
