@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.typing import Key, Motions
 from jaxreg.geometry.nearest_rotation import nearest_rotation
-from jaxreg.linear.small import cross, entries, product
+from jaxreg.linear.small import cross, entries, of_one_rank, product
 
 
 # Below this angle series are exact to float64, and quotients are not.
@@ -237,6 +237,7 @@ def between(
     T_a_b: Float[Array, "*#b D D"], T_a_c: Float[Array, "*#b D D"]
 ) -> Float[Array, "*b D D"]:
     """`T_b_c`, the inverse of the one times the other."""
+    T_a_b, T_a_c = of_one_rank(T_a_b, T_a_c)
     shift = translation(T_a_c) - translation(T_a_b)
     moved = jnp.concatenate([rotation(T_a_c), shift[..., None]], axis=-1)
     return _with_last_row(product(jnp.swapaxes(rotation(T_a_b), -1, -2), moved))

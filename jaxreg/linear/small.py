@@ -26,11 +26,16 @@ def product(
     400,000 products of 4 x 4 take 10 ms on one CPU core; as a sum over an axis of a
     broadcast product 100, by `einsum` 340.
     """
-    rank = max(A.ndim, B.ndim)
-    A, B = (jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in (A, B))
+    A, B = of_one_rank(A, B)
     columns, rows = (jnp.split(x, A.shape[-1], axis) for x, axis in ((A, -1), (B, -2)))
     terms = [a * b for a, b in zip(columns, rows, strict=True)]
     return sum(terms[1:], terms[0])
+
+
+def of_one_rank(a: Array, b: Array) -> list[Array]:
+    """Both with as many axes, new ones first."""
+    rank = max(a.ndim, b.ndim)
+    return [jnp.expand_dims(x, tuple(range(rank - x.ndim))) for x in (a, b)]
 
 
 def cross(a: Array, b: Array, axis: int = -1) -> Array:

@@ -27,7 +27,7 @@ def _hilbert_keys(points: Array, mask: Array, bits: int) -> Int[Array, " n"]:
     """Skilling 2004, Programming the Hilbert curve: axes to the transposed index."""
     d = points.shape[1]
     low, side = bounding_cube(points, mask)
-    cells = (points - low) / side * (1 << bits)
+    cells = (points - low[None]) / side * (1 << bits)
     cells = jnp.clip(cells, 0, (1 << bits) - 1).astype(jnp.int32)
     x = [cells[:, axis] for axis in range(d)]
     for level in range(bits - 1, 0, -1):
