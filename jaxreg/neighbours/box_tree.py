@@ -160,7 +160,7 @@ class BoxTree(AbstractIndex):
 
             def insert(at: Array, found: _Found) -> _Found:
                 sq, row = found
-                new = _sq_distance(queries, points[:, at])
+                new = _sq_distance(queries, points[:, at])[None]
                 # Ascending lists: what is farther than the new one moves down.
                 above = jnp.pad(sq[:-1], ((1, 0), (0, 0)), constant_values=-jnp.inf)
                 row_above = jnp.pad(row[:-1], ((1, 0), (0, 0)))
