@@ -12,12 +12,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.programs import kept_program
+from jaxreg._core.status import Status
 from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.matching import NO_EVIDENCE
-from jaxreg.multiview.place import Placement, place
+from jaxreg.multiview.place import Placement, agreeing, joins, place
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import measured, wide_unless_given
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -80,13 +81,46 @@ class Held(eqx.Module):
         """
         averaging, placed = wide_unless_given(averaging), _brought(self, scans, found)
         count = jnp.max(jnp.where(scans.present, self.node, 0)) + 1
-        num_nodes = rows_for(2 + int(np.max(np.asarray(self.node))))
         for exact in (False, True):
             motions = measured(scans, placed, least, pairs, exact=exact)
             motions = _contracted(self, placed, motions)
-            nodes = place(motions, num_nodes, averaging, least, count)
+            nodes = place(motions, self._num_nodes, averaging, least, count)
             placed = _expanded(self, placed, nodes)
         return placed
+
+    def in_round(
+        self,
+        scans: PreparedScans,
+        found: RelativeMotions,
+        size: int,
+        averaging: AbstractAverager | None,
+        least: Scalar,
+    ) -> tuple[Placement, np.ndarray]:
+        """Where all scans lie by what was found so far, and which pairs are trusted.
+
+        Those of two that stay are trusted where they agree with their poses.
+
+        Args:
+            scans: prepared scans.
+            found: motions of pairs, of NumPy arrays.
+            size: for how many pairs to compile.
+            averaging: as in `place`.
+            least: log evidence of the pairs that count.
+        """
+        own = np.asarray(self.held)[found.pairs].all(axis=1)
+        rows, before = np.flatnonzero(~own), _at_rest(self, scans)
+        motions = found.on_host(rows).padded(rounded_up(len(rows)))
+        motions = _contracted(self, before, motions)
+        nodes = place(motions, self._num_nodes, averaging, least, scans.count)
+        placed = _expanded(self, before, nodes)
+        trusted = np.asarray(_agrees(found.padded(size), placed, least))[: len(own)]
+        trusted = trusted & own
+        trusted[rows] = np.asarray(joins(nodes.edge_weight))[: len(rows)]
+        return placed, trusted
+
+    @property
+    def _num_nodes(self) -> int:
+        return rows_for(2 + int(np.max(np.asarray(self.node))))
 
     def in_world(self, solution: ReconstructionSolution) -> ReconstructionSolution:
         """A solution in the world of those that stay, which have their very poses."""
@@ -104,10 +138,7 @@ class Held(eqx.Module):
 @kept_program
 def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
     """With the held poses; each other scan follows the held one nearest to it."""
-    ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
-    one = jnp.argmax(hold.held).astype(jnp.int32)
-    T_one_i = lie.between(hold.T_world_i[one], hold.T_world_i)
-    T_held = scans.to_centred_frames(T_one_i, jnp.full_like(ids, one), ids)
+    T_held = _centred(hold, scans)
     centre = lie.translation(found.T_world_i)
 
     def nearest(scan: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -124,6 +155,39 @@ def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
     with_held = hold.held | has_held
     part = jnp.where(with_held, jnp.argmax(with_held).astype(jnp.int32), found.part)
     return eqx.tree_at(lambda p: (p.T_world_i, p.part), found, (T, part))
+
+
+def _centred(hold: Held, scans: PreparedScans) -> Float[Array, "v D D"]:
+    """The poses that stay, of the centred frames, in the frame of the first."""
+    ids = jnp.arange(scans.num_scans, dtype=jnp.int32)
+    one = jnp.argmax(hold.held).astype(jnp.int32)
+    T_one_i = lie.between(hold.T_world_i[one], hold.T_world_i)
+    return scans.to_centred_frames(T_one_i, jnp.full_like(ids, one), ids)
+
+
+@kept_program
+def _at_rest(hold: Held, scans: PreparedScans) -> Placement:
+    """Those that stay, in one part; each other scan alone."""
+    ids, nothing = jnp.arange(scans.num_scans, dtype=jnp.int32), jnp.zeros(0, jnp.int32)
+    T = _centred(hold, scans)
+    eye = jnp.eye(T.shape[-1], dtype=T.dtype)
+    return Placement(
+        T_world_i=jnp.where(hold.held[:, None, None], T, eye[None]),
+        part=jnp.where(hold.held, jnp.argmax(hold.held).astype(jnp.int32), ids),
+        edge_weight=nothing.astype(T.dtype),
+        mode=nothing,
+        status=jnp.asarray(Status.CONVERGED, jnp.int32),
+        trace=None,
+        world=jnp.asarray(-1, jnp.int32),
+        misfit=jnp.zeros_like(hold.held),
+    )
+
+
+@kept_program
+def _agrees(
+    motions: RelativeMotions, placed: Placement, least: Scalar
+) -> Bool[Array, " e"]:
+    return agreeing(motions, placed, least)[1]
 
 
 @kept_program

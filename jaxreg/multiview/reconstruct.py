@@ -249,8 +249,7 @@ def _of_chosen_pairs(
         workers = None
         if executor is not None:
             workers = stack.enter_context(Workers(executor, method, prepared, key))
-        held = None if hold is None else np.asarray(hold.held)
-        told = before, on_pairs, report, workers, held
+        told = before, on_pairs, report, workers, hold
         rounds = Rounds(method, averaging, prepared, key, *told)
         motions = rounds.run(order, first, words)
     report("averaging and refining", 0, 1)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.platforms import platform_of
-from jaxreg._core.typing import Key, Progress
+from jaxreg._core.typing import Key, Progress, Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.padding import rounded_up
 from jaxreg.batching.threads import map_in_threads
@@ -24,6 +24,7 @@ from jaxreg.multiview.follow_sequence import (
     descended,
     descended_in_input_frames,
 )
+from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.likely_overlap import LikelyOverlap, NearPairs
 from jaxreg.multiview.method import min_log_evidence, num_kept
 from jaxreg.multiview.place import Placement, joins, likely, place
@@ -55,7 +56,7 @@ class Rounds:
         on_pairs: told of every batch, or None.
         report: told of progress.
         workers: who registers pairs; None for threads of this process.
-        held: `(v,)` scans that stay where they are, or None.
+        hold: old frames that stay, or None.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class Rounds:
         on_pairs: OnPairs | None,
         report: Progress,
         workers: Workers | None = None,
-        held: np.ndarray | None = None,
+        hold: Held | None = None,
     ) -> None:
         self.workers = workers
         self.method, self.averaging, self.scans = method, averaging, scans
@@ -78,6 +79,8 @@ class Rounds:
             self.known = known.with_modes(num_kept(method))
             ids = map(tuple, np.asarray(known.pairs).tolist())
             self.row = {pair: row for row, pair in enumerate(ids)}
+        self.hold = hold
+        held = None if hold is None else np.asarray(hold.held)
         self.overlaps = LikelyOverlap(scans, held)
         self.found: list[RelativeMotions] = []
         self.sure: dict[tuple[int, int], RelativeMotions] = {}
@@ -227,16 +230,26 @@ class Rounds:
     def _evidence(self) -> tuple[Placement, np.ndarray, np.ndarray, NearPairs]:
         """Present poses, the pairs tried, those trusted, and those that may overlap."""
         found = RelativeMotions.joined(self.found)
-        scans = self.scans
-        least = jnp.asarray(min_log_evidence(self.method), scans.radius.dtype)
+        least = jnp.asarray(min_log_evidence(self.method), self.scans.radius.dtype)
+        if self.hold is None:
+            placement, trusted = self._placed(found, least)
+        else:
+            told = found, self.num_rows, self.averaging, least
+            placement, trusted = self.hold.in_round(self.scans, *told)
+        near = self.overlaps.of(placement, seed=len(trusted))
+        return placement, np.asarray(found.pairs), trusted, near
+
+    def _placed(
+        self, found: RelativeMotions, least: Scalar
+    ) -> tuple[Placement, np.ndarray]:
+        """Present poses, and which pairs are trusted."""
         size, rows = self.num_rows, np.arange(len(found.overlap))
         if self.num > _LARGE:
             rows = np.flatnonzero(np.asarray(likely(found, least)).any(axis=1))
             size = rounded_up(len(rows), an_octave=1)
         motions = found.on_host(rows).padded(size)
-        told = self.averaging, least, scans.count
-        placement = place(motions, scans.num_scans, *told)
+        told = self.averaging, least, self.scans.count
+        placement = place(motions, self.scans.num_scans, *told)
         trusted = np.zeros(len(found.overlap), bool)
         trusted[rows] = np.asarray(joins(placement.edge_weight))[: len(rows)]
-        near = self.overlaps.of(placement, seed=len(found.overlap))
-        return placement, np.asarray(found.pairs), trusted, near
+        return placement, trusted

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,7 @@ from growing import SCANS, T_WORLD
 from helpers import pose_error
 
 import jaxreg as jr
+from jaxreg.geometry import lie
 from jaxreg.multiview import (
     likely_overlap,
     place,
@@ -19,6 +21,8 @@ from jaxreg.multiview import (
     relative_motions,
     scan_blocks,
 )
+from jaxreg.multiview.hold_poses import Held
+from jaxreg.multiview.place import displacement
 from jaxreg.multiview.prepared_scans import PreparedScans
 
 
@@ -120,6 +124,28 @@ def test_new_scans_lie_beside_those_that_are_held():
     np.testing.assert_array_equal(after.T_world_i[:4], before.T_world_i)
     T = np.linalg.inv(T_WORLD[0]) @ T_WORLD[4]
     assert pose_error(after.T_world_i[4], T)[0] < 0.02
+
+
+def test_in_a_round_pairs_of_two_that_stay_count_as_their_poses_have_them():
+    every, scans = _solved(5), _prepared(5)
+    found = every.motions.heard(scans).on_host()
+    ids = found.pairs.tolist()
+    T = found.T_i_j.copy()
+    T[ids.index([0, 1])] = T[ids.index([0, 2])]  # of two that stay: wrong
+    found = eqx.tree_at(lambda m: m.T_i_j, found, T)
+    hold = Held.of(_solved(4), scans)
+    placed, trusted = hold.in_round(scans, found, 16, jr.SpanningTree(), jnp.zeros(()))
+    told = dict(zip(map(tuple, ids), trusted.tolist(), strict=True))
+    assert not told[0, 1]
+    assert told[0, 2]
+    assert told[1, 2]
+    assert any(told[k, 4] for k in range(4))
+    np.testing.assert_array_equal(placed.part[:5], np.zeros(5))
+    apart, _ = displacement(
+        lie.between(placed.T_world_i[0], placed.T_world_i[4]),
+        jnp.asarray(found.T_i_j[ids.index([0, 4]), 0]),
+    )
+    assert apart < 0.02
 
 
 def test_padding_is_the_last_scan_again_and_cannot_be_registered():
