@@ -49,7 +49,7 @@ def cases(options: Options) -> Iterator[Case]:
                 "jaxreg",
                 "jaxreg",
                 "reconstruct, pairs replayed",
-                partial(_solved, scans, T_world_i, place, _SHARE[scene]),
+                partial(_solved, scans, T_world_i, place, SHARES[scene]),
             )
             yield Case(
                 name=f"{scene}, {num} scans",
@@ -131,7 +131,7 @@ def _share_on_object(chord: np.ndarray) -> np.ndarray:
     return 2 / np.pi * (np.arccos(x) - x * np.sqrt(1 - x**2))
 
 
-_SHARE = {"street": _share_on_street, "object": _share_on_object}
+SHARES = {"street": _share_on_street, "object": _share_on_object}
 
 
 class Replayed(Executor):

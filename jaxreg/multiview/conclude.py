@@ -53,13 +53,16 @@ def finish(
     """
     moving, scans = scans, lax.stop_gradient(scans)
     least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
-    placement = place(motions, scans.num_scans, averaging, least, scans.count)
+    if hold is None:
+        placement = place(motions, scans.num_scans, averaging, least, scans.count)
+    else:
+        placement = hold.place(scans, motions, averaging, least)
     mode, turns = placement.mode, turnable(motions, placement)
     pairs = near_pairs(scans, placement, motions, overlaps)
     likely = least - _VOUCHED
     if hold is not None:
         pairs = hold.of_new(pairs)
-        placement = hold.place(scans, placement, averaging, likely, pairs)
+        placement = hold.refine(scans, placement, averaging, likely, pairs)
         free = turns | slipping(scans, placement, least, pairs, hold.held)
         free = free & ~hold.held
         solution = _solution(scans, motions, mode, placement, free, least)

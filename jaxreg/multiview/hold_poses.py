@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.programs import kept_program
@@ -18,7 +17,7 @@ from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.matching import NO_EVIDENCE
-from jaxreg.multiview.place import Placement, agreeing, joins, place
+from jaxreg.multiview.place import Placement, agreeing, place
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import measured, wide_unless_given
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -65,58 +64,69 @@ class Held(eqx.Module):
     def place(
         self,
         scans: PreparedScans,
-        found: Placement,
+        motions: RelativeMotions,
+        averaging: AbstractAverager | None,
+        least: Scalar,
+    ) -> Placement:
+        """Where all scans lie by what was found; averages what is new alone.
+
+        Pairs of two that stay are trusted where they agree with their poses.
+
+        Args:
+            scans: prepared scans.
+            motions: of pairs, some of them padding.
+            averaging: as in `place`.
+            least: log evidence of the pairs that count.
+        """
+        pairs = np.asarray(motions.pairs)
+        held, padding = np.asarray(self.held)[pairs], pairs[:, 0] == pairs[:, 1]
+        (rows,) = np.nonzero(~(held.all(axis=1) | padding))
+        before = _at_rest(self, scans)
+        new = motions.on_host(rows).padded(rounded_up(len(rows)))
+        new = _contracted(self, before, new)
+        nodes = place(new, self._num_nodes, averaging, least, scans.count)
+        placed = _expanded(self, scans.present, before, nodes)
+        mode, agrees = map(np.array, _agreeing(motions, placed, least))
+        agrees[padding] = False
+        status, some = nodes.status, bool(np.any(np.delete(agrees, rows)))
+        if some and int(status) == Status.NO_AGREEMENT:
+            status = jnp.asarray(Status.CONVERGED, jnp.int32)
+        trust = agrees.astype(before.T_world_i.dtype)
+        trust[rows] = np.asarray(nodes.edge_weight)[: len(rows)]
+        mode[rows] = np.asarray(nodes.mode)[: len(rows)]
+        told = jnp.asarray(trust), jnp.asarray(mode), status, nodes.trace
+        return eqx.tree_at(
+            lambda p: (p.edge_weight, p.mode, p.status, p.trace),
+            placed,
+            told,
+            is_leaf=lambda x: x is None,
+        )
+
+    def refine(
+        self,
+        scans: PreparedScans,
+        placed: Placement,
         averaging: AbstractAverager | None,
         least: Scalar,
         pairs: Int[Array, "p 2"],
     ) -> Placement:
-        """The others beside those that stay.
+        """The others by pairs measured anew, beside those that stay.
 
         Args:
             scans: prepared scans.
-            found: where all of them lie, none held.
-            averaging: as in `place`.
+            placed: by `place`.
+            averaging: as in `refine`.
             least: log evidence of the pairs that count.
             pairs: those that may overlap (`near_pairs`), of scans that do not stay.
         """
-        averaging, placed = wide_unless_given(averaging), _brought(self, scans, found)
+        averaging = wide_unless_given(averaging)
         count = jnp.max(jnp.where(scans.present, self.node, 0)) + 1
         for exact in (False, True):
             motions = measured(scans, placed, least, pairs, exact=exact)
             motions = _contracted(self, placed, motions)
             nodes = place(motions, self._num_nodes, averaging, least, count)
-            placed = _expanded(self, placed, nodes)
+            placed = _expanded(self, scans.present, placed, nodes)
         return placed
-
-    def in_round(
-        self,
-        scans: PreparedScans,
-        found: RelativeMotions,
-        size: int,
-        averaging: AbstractAverager | None,
-        least: Scalar,
-    ) -> tuple[Placement, np.ndarray]:
-        """Where all scans lie by what was found so far, and which pairs are trusted.
-
-        Those of two that stay are trusted where they agree with their poses.
-
-        Args:
-            scans: prepared scans.
-            found: motions of pairs, of NumPy arrays.
-            size: for how many pairs to compile.
-            averaging: as in `place`.
-            least: log evidence of the pairs that count.
-        """
-        own = np.asarray(self.held)[found.pairs].all(axis=1)
-        rows, before = np.flatnonzero(~own), _at_rest(self, scans)
-        motions = found.on_host(rows).padded(rounded_up(len(rows)))
-        motions = _contracted(self, before, motions)
-        nodes = place(motions, self._num_nodes, averaging, least, scans.count)
-        placed = _expanded(self, before, nodes)
-        trusted = np.asarray(_agrees(found.padded(size), placed, least))[: len(own)]
-        trusted = trusted & own
-        trusted[rows] = np.asarray(joins(nodes.edge_weight))[: len(rows)]
-        return placed, trusted
 
     @property
     def _num_nodes(self) -> int:
@@ -133,28 +143,6 @@ class Held(eqx.Module):
         )
         T = jnp.where(self.held[:, None, None], self.T_world_i, T)
         return eqx.tree_at(lambda s: s.T_world_i, solution, T)
-
-
-@kept_program
-def _brought(hold: Held, scans: PreparedScans, found: Placement) -> Placement:
-    """With the held poses; each other scan follows the held one nearest to it."""
-    T_held = _centred(hold, scans)
-    centre = lie.translation(found.T_world_i)
-
-    def nearest(scan: tuple[Array, Array]) -> tuple[Array, Array]:
-        here, part = scan
-        beside = hold.held & (found.part == part)
-        far = jnp.sum((centre - here) ** 2, axis=-1)
-        return jnp.argmin(jnp.where(beside, far, jnp.inf)), jnp.any(beside)
-
-    near, has_held = lax.map(nearest, (centre, found.part))
-    T_near_i = lie.between(found.T_world_i[near], found.T_world_i)
-    stays = hold.held | ~has_held
-    T = jnp.where(hold.held[:, None, None], T_held, T_held[near] @ T_near_i)
-    T = jnp.where((stays & ~hold.held)[:, None, None], found.T_world_i, T)
-    with_held = hold.held | has_held
-    part = jnp.where(with_held, jnp.argmax(with_held).astype(jnp.int32), found.part)
-    return eqx.tree_at(lambda p: (p.T_world_i, p.part), found, (T, part))
 
 
 def _centred(hold: Held, scans: PreparedScans) -> Float[Array, "v D D"]:
@@ -183,11 +171,7 @@ def _at_rest(hold: Held, scans: PreparedScans) -> Placement:
     )
 
 
-@kept_program
-def _agrees(
-    motions: RelativeMotions, placed: Placement, least: Scalar
-) -> Bool[Array, " e"]:
-    return agreeing(motions, placed, least)[1]
+_agreeing = kept_program(agreeing)
 
 
 @kept_program
@@ -209,12 +193,17 @@ def _contracted(
 
 
 @kept_program
-def _expanded(hold: Held, before: Placement, nodes: Placement) -> Placement:
-    """Poses of the scans by those of the nodes."""
-    beside = nodes.together(hold.node, jnp.zeros_like(hold.node))
+def _expanded(
+    hold: Held, present: Bool[Array, " v"], before: Placement, nodes: Placement
+) -> Placement:
+    """Poses of the scans by those of the nodes, in the world of those that stay."""
     T = lie.between(nodes.T_world_i[0], nodes.T_world_i)[hold.node]
-    moves = (beside & ~hold.held)[:, None, None]
-    T = jnp.where(moves, T, before.T_world_i)
-    ids = jnp.arange(len(beside), dtype=jnp.int32)
-    part = jnp.where(beside, jnp.argmax(beside).astype(jnp.int32), ids)
-    return eqx.tree_at(lambda p: (p.T_world_i, p.part), before, (T, part))
+    T = jnp.where(hold.held[:, None, None], before.T_world_i, T)
+    part = nodes.part[hold.node]
+    ids = jnp.arange(len(part), dtype=jnp.int32)
+    part = jax.ops.segment_min(ids, part, len(part))[part]
+    part = jnp.where(present, part, ids)
+    world = part[jnp.argmax(hold.held)]
+    return eqx.tree_at(
+        lambda p: (p.T_world_i, p.part, p.world), before, (T, part, world)
+    )

@@ -234,8 +234,9 @@ class Rounds:
         if self.hold is None:
             placement, trusted = self._placed(found, least)
         else:
-            told = found, self.num_rows, self.averaging, least
-            placement, trusted = self.hold.in_round(self.scans, *told)
+            told = found.padded(self.num_rows), self.averaging, least
+            placement = self.hold.place(self.scans, *told)
+            trusted = np.asarray(joins(placement.edge_weight))[: len(found.overlap)]
         near = self.overlaps.of(placement, seed=len(trusted))
         return placement, np.asarray(found.pairs), trusted, near
 

@@ -134,8 +134,11 @@ def test_in_a_round_pairs_of_two_that_stay_count_as_their_poses_have_them():
     T[ids.index([0, 1])] = T[ids.index([0, 2])]  # of two that stay: wrong
     found = eqx.tree_at(lambda m: m.T_i_j, found, T)
     hold = Held.of(_solved(4), scans)
-    placed, trusted = hold.in_round(scans, found, 16, jr.SpanningTree(), jnp.zeros(()))
-    told = dict(zip(map(tuple, ids), trusted.tolist(), strict=True))
+    told = found.padded(16), jr.SpanningTree(), jnp.zeros(())
+    placed = hold.place(scans, *told)
+    trusted = np.asarray(place.joins(placed.edge_weight))
+    assert not np.any(trusted[len(ids) :])
+    told = dict(zip(map(tuple, ids), trusted.tolist(), strict=False))
     assert not told[0, 1]
     assert told[0, 2]
     assert told[1, 2]
@@ -146,6 +149,25 @@ def test_in_a_round_pairs_of_two_that_stay_count_as_their_poses_have_them():
         jnp.asarray(found.T_i_j[ids.index([0, 4]), 0]),
     )
     assert apart < 0.02
+
+
+def test_new_scans_that_join_each_other_alone_are_a_part_of_their_own():
+    scans = _prepared(9)
+    hold = Held.of(_solved(3), scans)
+    pairs = np.array([[0, 1], [0, 2], [1, 2], [3, 4], [4, 5], [5, 6]], np.int32)
+    found = relative_motions.relative_motions(
+        jr.ICP(), scans, jnp.asarray(pairs), jax.random.key(0)
+    )
+    told = found.padded(8), jr.SpanningTree(), jnp.zeros(())
+    placed = hold.place(scans, *told)
+    # Those that stay come first, though the others are more.
+    component = [0, 0, 0, 1, 1, 1, 1]
+    np.testing.assert_array_equal(placed.component[:7], component)
+    # The last have no points, or are padding.
+    assert len(placed.component) == 12
+    assert np.all(np.asarray(placed.component[7:]) == -1)
+    T_5_6 = lie.between(placed.T_world_i[5], placed.T_world_i[6])
+    np.testing.assert_allclose(T_5_6, found.T_i_j[5, 0], atol=1e-5)
 
 
 def test_padding_is_the_last_scan_again_and_cannot_be_registered():
