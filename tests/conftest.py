@@ -23,6 +23,16 @@ _FLAGS += ["--xla_force_host_platform_device_count=8"]
 os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
 
 
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks what `slow.txt` names."""
+    lines = (Path(__file__).parent / "slow.txt").read_text().splitlines()
+    slow = {f"tests/{line}" for line in lines if not line.startswith("#")}
+    for item in items:
+        if slow & {item.nodeid, item.nodeid.partition("[")[0]}:
+            item.add_marker("slow")
+
+
 def pytest_collection_finish() -> None:
     """Tracing makes much garbage: looking through all that lives costs a fifth."""
     gc.freeze()

@@ -150,7 +150,6 @@ def test_the_ground_with_nine_tenths_of_the_points_does_not_decide():
     assert shift < 0.1
 
 
-@pytest.mark.slow
 def test_hundred_thousand_points_on_three_hundred():
     T_true = motion(5, 3, angle=1.5, shift=0.5)
     source = move(np.linalg.inv(T_true), blob(100_000, 3, 1).astype(np.float64))

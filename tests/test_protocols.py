@@ -1,7 +1,7 @@
 """Every public method and part keeps its contract, inside `jit`, `vmap` and `grad`."""
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -49,25 +49,6 @@ from jaxreg.testing.promises import (
     promise_same,
     promise_traced_numbers,
 )
-
-
-#: Whose whole check is left to `-m slow`: each shares its parts with one that is not.
-SLOW = {
-    *("MultiStart", "sandhu2010", "KernelCorrelation by optimistix"),
-    *("PoseGraphLM by optimistix", "RiemannianStaircase"),
-    *("CycleConsensus", "MCC", "WeightedMotionAveraging", "LowRankSparse"),
-    *("BoxTree", "CellGrid"),
-}
-
-
-def _marked(names: Iterable[Any]) -> list[Any]:
-    """Names of a table for `parametrize`, with the mark of those that take long."""
-    marks = {True: pytest.mark.slow, False: ()}
-    return [pytest.param(x, marks=marks[_name(x) in SLOW], id=_name(x)) for x in names]
-
-
-def _name(x: Any) -> str:
-    return x if isinstance(x, str) else x.__name__
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -127,7 +108,7 @@ def test_every_public_method_is_in_the_table():
     assert functions == FUNCTIONS
 
 
-@pytest.mark.parametrize("name", _marked(REGISTRARS))
+@pytest.mark.parametrize("name", REGISTRARS)
 def test_methods_of_register(name, monkeypatch):
     row = REGISTRARS[name]
     # Gradients are those of pulls that balance, which takes more last steps than most
@@ -152,7 +133,7 @@ def test_methods_of_register(name, monkeypatch):
     check_registrar(method, d=d, **row.promises)
 
 
-@pytest.mark.parametrize("name", _marked(AVERAGERS))
+@pytest.mark.parametrize("name", AVERAGERS)
 def test_methods_of_average(name):
     row = AVERAGERS[name]
     method = row.make(3)
@@ -168,7 +149,7 @@ def test_methods_of_average(name):
     check_averager(method, **row.promises)
 
 
-@pytest.mark.parametrize("index", _marked(INDEXES))
+@pytest.mark.parametrize("index", INDEXES, ids=lambda x: x.__name__)
 def test_indexes(index):
     row = INDEXES[index]
     with jax.debug_nans(False):  # queries that are not finite are asked on purpose

@@ -90,12 +90,12 @@ L1_POINT = jr.ICP(jr.PointToPoint(), L1(), jr.GaussNewton(), max_steps=200)
 @pytest.mark.parametrize(
     ("d", "method"),
     [
-        pytest.param(2, PLANE, marks=pytest.mark.slow),
+        (2, PLANE),
         (2, BESL_MCKAY),
         (3, PLANE),
-        pytest.param(3, BESL_MCKAY, marks=pytest.mark.slow),
+        (3, BESL_MCKAY),
         (3, L1_POINT),
-        pytest.param(3, jr.ICP(index=jr.VoxelTable), marks=pytest.mark.slow),
+        (3, jr.ICP(index=jr.VoxelTable)),
     ],
     ids=["2-plane", "2-besl-mckay", "3-plane", "3-besl-mckay", "3-l1", "3-table"],
 )

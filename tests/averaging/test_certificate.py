@@ -151,9 +151,8 @@ def test_no_poses_are_below_the_bound(d: int):
         assert found.gap == found.objective - found.lower_bound
 
 
-# In the plane the staircase is climbed by `test_public_graphs_from_random_poses`, too.
-@pytest.mark.parametrize("d", [pytest.param(2, marks=pytest.mark.slow), 3])
-@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_a_twisted_ring_is_not_certified_and_the_staircase_untwists_it(
     d: int, noise: float
 ):

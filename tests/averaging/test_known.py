@@ -197,8 +197,7 @@ def test_a_fixed_pose_stays_and_decides():
     assert np.asarray(sol.prior_weight)[1] == 0
 
 
-# What is told of points is adjusted to in `test_all_that_is_known_is_adjusted_at_once`.
-@pytest.mark.parametrize("told", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("told", [False, True])
 def test_almost_half_of_the_control_points_may_be_wrong(told: bool):
     X, graph = survey()
     rng = np.random.default_rng(1)

@@ -177,7 +177,7 @@ def test_near_views_tell_the_truth_from_a_larger_group_of_wrong_motions():
 METHODS = [
     jr.Correntropy(),
     # As by default, but for the start.
-    pytest.param(jr.Correntropy(initialiser=jr.SpanningTree()), marks=pytest.mark.slow),
+    jr.Correntropy(initialiser=jr.SpanningTree()),
     jr.MCC(),
     MotionAveraging(),
     jr.WeightedMotionAveraging(),

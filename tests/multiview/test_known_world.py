@@ -183,7 +183,6 @@ def test_map_coordinates_keep_their_digits(found):
         assert np.abs(move(pose, points) - move(true, points)).max() < 0.01
 
 
-@pytest.mark.slow  # of averaging: averaging/test_known.py
 def test_poses_follow_what_is_known(found):
     _, truth, _, _ = found
     turn = jnp.asarray(truth[1], jnp.float32)

@@ -58,10 +58,7 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["of somebody else", pytest.param("MultiStart", marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("name", ["of somebody else", "MultiStart"])
 def test_any_registrar_reconstructs(name):
     sol = jr.reconstruct(SCANS, key=KEY, method=METHODS[name])
     assert np.all(sol.placed)

@@ -68,7 +68,6 @@ def test_the_truth_is_in_the_region_of_icp_as_often_as_it_says(noise):
     assert 0.9 <= _share(source, target, truth, jr.ICP(), init) <= 0.99
 
 
-@pytest.mark.slow
 def test_the_truth_is_in_the_region_of_the_search_as_often_as_it_says():
     source, target, truth = _trials(24, 0.3)
     assert 0.9 <= _share(source, target, truth, None, None)

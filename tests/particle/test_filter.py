@@ -261,8 +261,7 @@ def test_the_papers_settings_are_for_points_of_their_dimension(d):
         sandhu2010(other).iteration(points, points, key=KEY)
 
 
-# In space, `register` says so of a search in tests/test_registration.py, too.
-@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("d", [2, 3])
 def test_the_papers_settings_say_that_too_few_points_tell_no_rotation(d):
     few = np.arange(N)[:, None] < d
     points = np.where(few, blob(N, d), 0)
