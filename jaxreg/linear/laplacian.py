@@ -82,7 +82,7 @@ def _prepared(
 ) -> Callable[[Array], Array]:
     """The solution of the system, by `dense` up to `DENSE_LIMIT` frames."""
     matrix = GraphLaplacian.anchored(edges, weight[:, None, None], num_poses)
-    solver = dense if num_poses <= DENSE_LIMIT else MultigridCG(tolerance)
+    solver = solver_for(num_poses, dense, tolerance)
     state = solver.init(matrix, {})
 
     def solve(rhs: Array) -> Array:
@@ -92,6 +92,13 @@ def _prepared(
         return x.at[0].set(0)
 
     return solve
+
+
+def solver_for(
+    num_poses: int, dense: AbstractSymmetricSolver, tolerance: float = 0.0
+) -> AbstractSymmetricSolver:
+    """`dense` up to `DENSE_LIMIT` frames, above gradients to a relative tolerance."""
+    return dense if num_poses <= DENSE_LIMIT else MultigridCG(tolerance)
 
 
 def laplacian(

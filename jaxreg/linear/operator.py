@@ -46,15 +46,16 @@ class GraphLaplacian(lx.AbstractLinearOperator):
         damping: Float[Array, ""] | float = 0.0,
         origin: Float[Array, "v d"] | None = None,
         columns: int = 1,
+        anchor: Int[Array, ""] | int = 0,
     ) -> "GraphLaplacian":
-        """With `damping` times its diagonal, and frame 0 tied to the ground.
+        """With `damping` times its diagonal, and one frame tied to the ground.
 
         Without damping, and for right-hand sides that sum to 0, the tie bears nothing:
-        solutions are those with x_0 = 0.
+        solutions are those with x = 0 of the anchor.
         """
         none = jnp.zeros((num_poses, *weight.shape[1:]), weight.dtype)
         blocks = cls(edges, weight, none, origin).blocks()
-        own = (damping * blocks).at[0].add(blocks[0])
+        own = (damping * blocks).at[anchor].add(blocks[anchor])
         return cls(edges, weight, own, origin, columns)
 
     def mv(self, vector: Float[Array, "v k c"]) -> Float[Array, "v k c"]:

@@ -7,6 +7,8 @@ to every pose, is one term, as the pairs of a scan share its errors: motions tha
 with each other may be wrong together.
 """
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,6 +23,7 @@ from jaxreg.geometry import lie
 from jaxreg.linear.small import product
 from jaxreg.local.covariance import answer, inverse_within
 from jaxreg.matching.problem import match
+from jaxreg.multiview.follow_motions import follow_motions
 from jaxreg.multiview.given_scans import GivenScans
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import WIDTH_END, optimiser_of
@@ -31,8 +34,10 @@ from jaxreg.particle import AbstractSearch, ParticleFilter
 
 # Edge of a cell in sample spacings: some ten points of a scan.
 _CELL = 3.0
-# Cells that are told apart; two that are not are taken as one, which does no harm.
-_MOST = 4096
+# Sums that cells are kept in. Variances from so many have errors of sqrt(2 / number):
+# a fiftieth from the most, a tenth from the fewest. In between as many as have room,
+# which is counted in sums times scans.
+_MOST, _LEAST, _ROOM = 4096, 256, 2**22
 _PRIMES = (73_856_093, 19_349_663, 83_492_791)  # Teschner et al. 2003
 # Poses around the answer at which pulls and answers are taken.
 _AROUND = 4
@@ -111,69 +116,35 @@ def _trusted(
     return np.concatenate([edges[used], pad]), np.append(weight, np.zeros(more))
 
 
-class _Graph(eqx.Module):
-    """Trusted pairs of centred frames, averaged by least squares.
+class _Surfaces(eqx.Module):
+    """What the surfaces of pairs say of their motions.
 
     Attributes:
         scans: prepared scans.
-        edges: `(e, 2)` scans i and j.
-        weight: `(e,)` of each.
         T: `(v, d+1, d+1)` poses of the centred frames, in radii.
     """
 
     scans: PreparedScans
-    edges: Int[Array, "e 2"]
-    weight: Float[Array, " e"]
     T: Float[Array, "v D D"]
 
-    def solver(self, first: Array) -> Float[Array, "n n"]:
-        """Maps pulls on the tangents of poses to these, with one scan held."""
-        v, k = len(self.T), lie.tangent_dim(self.T.shape[-1] - 1)
-        eye = jnp.eye(k, dtype=self.T.dtype)
+    @property
+    def to_own_axes(self) -> Float[Array, "v k k"]:
+        """From the axes of the world to those of each pose."""
+        R = jnp.swapaxes(lie.rotation(self.T), -1, -2)
+        return lie.adjoint(lie.compose(R, jnp.zeros_like(R[:, 0])))
 
-        def add(N: Array, edge: tuple[Array, Array]) -> tuple[Array, None]:
-            (i, j), w = edge
-            ends = ((i, self._by_first(i, j)), (j, eye))
-            for a, of_a in ends:
-                for b, of_b in ends:
-                    N = N.at[a, :, b].add(w * full_matmul(of_a.T, of_b))
-            return N, None
+    def errors(
+        self, i: Array, j: Array, around: Float[Array, "r v k"], num: int
+    ) -> Float[Array, "r k c"]:
+        """What the cells of each sum add to the motion of a pair, at frame j.
 
-        N = jnp.zeros((v, k, v, k), self.T.dtype)
-        N, _ = lax.scan(add, N, (self.edges, self.weight))
-        free = jnp.zeros(v, bool).at[self.edges].set(True).at[first].set(False)
-        free = jnp.repeat(free, k)
-        both = free[:, None] & free
-        N = jnp.where(both, N.reshape(v * k, v * k), jnp.eye(v * k, dtype=N.dtype))
-        return jnp.where(both, jnp.linalg.inv(N), 0)
-
-    def terms(
-        self, around: Float[Array, "r v k"], solver: Float[Array, "n n"]
-    ) -> Float[Array, "r c n"]:
-        """What each cell contributes to each pose, at poses moved by some tangents."""
-        v, k = around.shape[1:]
-
-        def add(total: Array, edge: tuple[Array, Array]) -> tuple[Array, None]:
-            (i, j), w = edge
-            y = w * self._errors(i, j, around)
-            by_first = jnp.einsum("rca,ab->rcb", y, self._by_first(i, j))
-            return total.at[:, :, i].add(by_first).at[:, :, j].add(y), None
-
-        total = jnp.zeros((len(around), _MOST, v, k), self.T.dtype)
-        total, _ = lax.scan(add, total, (self.edges, self.weight))
-        return total.reshape(len(around), _MOST, v * k) @ solver
-
-    def _by_first(self, i: Array, j: Array) -> Float[Array, "k k"]:
-        """The error of a motion by the tangent of its first frame."""
-        return -lie.adjoint(lie.between(self.T[j], self.T[i]))
-
-    def _errors(
-        self, i: Array, j: Array, around: Float[Array, "r v k"]
-    ) -> Float[Array, "r c k"]:
-        """What each cell adds to the right tangent of `T_i_j`."""
+        In the axes of the world, at poses moved by some tangents. A cell is in one of
+        `num` sums, with a sign drawn at random: then products of two that meet there
+        are as often below 0 as above.
+        """
         optimiser, problem = optimiser_of(self.T), self.scans.problem(i, j, exact=True)
         width = WIDTH_END * jnp.max(self.scans.spacing)
-        cell, ends = self._cells(i), jnp.stack([i, j])
+        (column, sign), ends = self._cells(i, num), jnp.stack([i, j])
 
         def at(move: Float[Array, "v k"]) -> tuple[Array, Array, Array]:
             T_i, T_j = product(self.T[ends], lie.exp(move[ends]))
@@ -182,23 +153,24 @@ class _Graph(eqx.Module):
             weight = optimiser.weights(found, width)
             A = answer(optimiser, problem, T_i_j, found, width, weight)
             H, _ = optimiser.residual.normal_equations(found, weight)
-            pulls = (optimiser.residual.descents(found) * weight).T
-            return A, H, jax.ops.segment_sum(pulls, cell[found.row], _MOST)
+            signed = weight * sign[found.row]
+            pulls = (optimiser.residual.descents(found) * signed).T
+            return A, H, jax.ops.segment_sum(pulls, column[found.row], num)
 
         A, H, pulls = lax.map(at, around)
         each = inverse_within(jnp.mean(A, axis=0), jnp.mean(H, axis=0))
-        # From the axes of frame i to those of frame j.
-        R = lie.rotation(lie.between(self.T[i], self.T[j]))
-        turn = lie.adjoint(lie.compose(R, jnp.zeros_like(R[0])))
-        return jnp.einsum("rca,ab->rcb", pulls, full_matmul(each, turn))
+        each = full_matmul(self.to_own_axes[i].T, each)
+        return jnp.einsum("ab,rcb->rac", each, pulls)
 
-    def _cells(self, i: Array) -> Int[Array, " n"]:
-        """Of each point of a scan the cell of the world that it lies in."""
+    def _cells(self, i: Array, num: int) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+        """Of the cell of the world that each point of a scan lies in: sum and sign."""
         size = _CELL * jnp.max(self.scans.spacing)
         place = lie.act(self.T[i], self.scans.cloud(i).points)
         place = jnp.floor(place / size).astype(jnp.int32)
         primes = jnp.asarray(_PRIMES[: place.shape[1]], jnp.int32)
-        return jnp.sum(place * primes, axis=1) % _MOST
+        code = jnp.sum(place * primes, axis=1)
+        sign = 1 - 2 * ((code // _MOST) % 2).astype(self.T.dtype)
+        return code % num, sign
 
 
 @eqx.filter_jit
@@ -213,15 +185,27 @@ def _covariances(
     R = lie.rotation(T_first_i)
     moved = lie.translation(T_first_i) + jnp.sum(R * scans.mean[:, None], axis=-1)
     T = lie.compose(R, (moved - moved[first]) / scans.radius)
-    graph = _Graph(scans, edges, weight, T)
-    v, d = scans.mean.shape
-    k = lie.tangent_dim(d)
-    solver = graph.solver(first)
-    at_rest = graph.terms(jnp.zeros((1, v, k), T.dtype), solver)[0]
+    surfaces = _Surfaces(scans, T)
+    (v, d), turn = scans.mean.shape, surfaces.to_own_axes
+    k, num = lie.tangent_dim(d), _num_sums(v)
+
+    def velocities(around: Float[Array, "r v k"]) -> Float[Array, "r v k c"]:
+        def errors(i: Array, j: Array) -> Float[Array, "r k c"]:
+            return surfaces.errors(i, j, around, num)
+
+        return follow_motions(edges, weight, T, first, errors, (len(around), num))
+
+    (at_rest,) = velocities(jnp.zeros((1, v, k), T.dtype))
     # Cells that go either way make poses as far off as the truth is.
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (_AROUND, _MOST))
-    around = jnp.asarray(signs, T.dtype) @ at_rest
-    terms = graph.terms(around.reshape(_AROUND, v, k), solver)
-    terms = terms.reshape(_AROUND * _MOST, v, k)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (_AROUND, num))
+    around = jnp.einsum("rc,vbc,vab->rva", jnp.asarray(signs, T.dtype), at_rest, turn)
+    moves = velocities(around)
+    total = jnp.einsum("rvac,rvbc->vab", moves, moves) / _AROUND
+    total = product(product(turn, total), jnp.swapaxes(turn, -1, -2))
     unit = jnp.where(jnp.arange(k) < d, scans.radius, 1)
-    return jnp.einsum("nva,nvb->vab", terms, terms) / _AROUND * jnp.outer(unit, unit)
+    return total * jnp.outer(unit, unit)
+
+
+def _num_sums(num_scans: int) -> int:
+    """How many sums of cells are kept; of very many scans fewer."""
+    return max(min(_MOST, 2 ** int(math.log2(_ROOM / num_scans))), _LEAST)

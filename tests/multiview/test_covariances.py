@@ -2,14 +2,18 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import motion
+from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import jaxreg as jr
+from jaxreg.linear import laplacian
+from jaxreg.multiview import covariances, follow_motions
 
 
 pytestmark = pytest.mark.usefixtures("fully_compiled")
@@ -60,11 +64,42 @@ def test_covariances_have_the_unit_of_the_scans_and_move_with_them(found):
     again = np.asarray(jr.scan_covariances(moved, other))
     unit = np.array([1000.0] * 3 + [1.0] * 3)
     # Other cells, and a turned scan is thinned to other points.
-    for k in (1, 2):
-        for part in (slice(3), slice(3, None)):
-            wanted = np.linalg.eigvalsh((C[k] * np.outer(unit, unit))[part, part])
-            own = np.linalg.eigvalsh(again[k][part, part])
-            assert np.all((own / wanted > 0.4) & (own / wanted < 2.5))
+    for k, R in ((1, np.eye(3)), (2, S[:3, :3])):
+        turn = unit[:, None] * np.kron(np.eye(2), R)
+        wanted = turn @ C[k] @ turn.T
+        # Of deviations in any direction.
+        ratio = np.sqrt(eigh(again[k], wanted, eigvals_only=True))
+        assert np.all((ratio > 0.6) & (ratio < 1.6)), ratio
+
+
+@pytest.mark.parametrize("limit", [2, 128])  # by gradients, and by a factor
+def test_poses_follow_the_errors_of_their_motions(monkeypatch, limit):
+    monkeypatch.setattr(laplacian, "DENSE_LIMIT", limit)
+    edges = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [1, 3]])
+    weight, v, first = np.array([1.0, 0.5, 2.0, 1.0, 0.3]), 4, 2
+    T = np.stack([motion(k, 3, angle=1.0, shift=2.0) for k in range(v)])
+    y = np.random.default_rng(0).normal(size=(v, v, 6, 1))
+    own = follow_motions.follow_motions(
+        jnp.asarray(edges),
+        jnp.asarray(weight, jnp.float32),
+        jnp.asarray(T, jnp.float32),
+        jnp.asarray(first),
+        lambda i, j: jnp.asarray(y)[i, j][None],
+        (1, 1),
+    )[0, :, :, 0]
+    # Velocities of the frames at the points of j, all in the axes of the world.
+    rows, told = [], []
+    for (i, j), w in zip(edges, weight, strict=True):
+        row, lever = np.zeros((6, v, 6)), T[j, :3, 3] - T[i, :3, 3]
+        row[:, j] += np.eye(6)
+        row[:, i] -= np.eye(6)
+        row[:3, i, 3:] -= np.stack([np.cross(x, lever) for x in np.eye(3)], axis=1)
+        rows.append(np.sqrt(w) * row)
+        told.append(np.sqrt(w) * y[i, j, :, 0])
+    J = np.delete(np.concatenate(rows), first, axis=1).reshape(-1, 6 * (v - 1))
+    x = np.linalg.lstsq(J, np.concatenate(told))[0].reshape(v - 1, 6)
+    np.testing.assert_allclose(np.delete(own, first, axis=0), x, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(own[first], 0, atol=1e-3)
 
 
 def test_of_scans_that_no_trusted_pair_holds_nothing_is_known(found):
@@ -74,6 +109,19 @@ def test_of_scans_that_no_trusted_pair_holds_nothing_is_known(found):
     C = jr.scan_covariances(scans, dataclasses.replace(sol, edge_weight=weight))
     assert np.isnan(C[4]).all()
     assert np.isfinite(np.delete(C, 4, axis=0)).all()
+
+
+def test_of_many_scans_covariances_are_those_of_few(found, monkeypatch):
+    scans, _, sol = found
+    C = np.asarray(jr.scan_covariances(scans, sol, relative_to=3))
+    monkeypatch.setattr(laplacian, "DENSE_LIMIT", 2)
+    monkeypatch.setattr(covariances, "_MOST", 512)
+    jax.clear_caches()
+    again = np.asarray(jr.scan_covariances(scans, sol, relative_to=3))
+    assert not again[3].any()
+    for k in set(range(NUM)) - {3}:
+        own, other = (np.sqrt(np.diag(x[k])) for x in (C, again))
+        np.testing.assert_allclose(other, own, rtol=0.25)
 
 
 def test_other_scans_are_refused(found):
