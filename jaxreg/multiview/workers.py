@@ -130,6 +130,7 @@ def _cancel(waiting: Iterable[Future[RelativeMotions]]) -> None:
         future.cancel()
 
 
+@functools.cache
 def _versions() -> tuple[str, ...]:
     """Of what the bits of an answer depend on."""
     own = sys.modules["jaxreg"].__version__  # it imports this file
