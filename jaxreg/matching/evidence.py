@@ -242,7 +242,8 @@ def _of_both(
 ) -> Evidence:
     gain = jnp.maximum((there.gain + back.gain) / 2, _LEAST_GAIN)
     near = _root(there.near * back.near)
-    firm = jnp.minimum(there.grip.firmness(radius), back.grip.firmness(radius))
+    grips = jax.tree.map(lambda *x: jnp.stack(x), there.grip, back.grip)
+    firm = jnp.min(grips.firmness(radius), axis=0)
     gain = jnp.log(gain)
     log_evidence = _GAIN * gain + _NEAR * near + _FIRM * firm - _OFFSET
     contact = _CONTACT_GAIN * gain + _CONTACT_NEAR * near - _CONTACT_OFFSET
