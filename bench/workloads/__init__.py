@@ -202,7 +202,10 @@ WORKLOADS = {
     "growing_maps": Workload(
         "Growing maps",
         "Ten more poses on a thousand of `large_graphs` by `average(previous=)`, and "
-        "beside it a graph of these ten alone, and all anew. Errors: of all poses.",
+        "beside it a graph of these ten alone, and all anew. Errors: of all poses. Ten "
+        "more scans on a thousand of the street of `many_scans`, made ready as a set, "
+        "whose poses are held, and beside it these ten alone: all but the search. "
+        "Errors: of the ten, after the best motion of all.",
     ),
     "multiview": Workload(
         "Many scans into one frame",
