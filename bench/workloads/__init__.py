@@ -206,6 +206,7 @@ WORKLOADS = {
         "more scans on a thousand of the street of `many_scans`, made ready as a set, "
         "whose poses are held, and beside it these ten alone: all but the search. "
         "Errors: of the ten, after the best motion of all.",
+        quick=False,
     ),
     "multiview": Workload(
         "Many scans into one frame",
