@@ -23,7 +23,7 @@ def follow_motions(
 ) -> Float[Array, "r v k c"]:
     """Velocities of all poses but the first, which is held, in the axes of the world.
 
-    Nothing is formed over all poses of many of them (`solver_for`).
+    Of many poses no matrix over all is formed (`solver_for`).
 
     Args:
         edges: frames i and j; every frame hangs together with the first or on nothing.

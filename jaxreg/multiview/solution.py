@@ -35,9 +35,9 @@ class ReconstructionSolution(eqx.Module):
             or UNIT_DIFFERS.
         placed: `(v,)` the scans of component 0.
         component: `(v,)` int32, the scans that trusted pairs join have one number: 0 is
-            the component of most scans, or all that what is known brings into the
-            world, -1 stands for scans alone. Nothing is known of how two components
-            lie.
+            the component of most scans, or of those whose poses are held, or all that
+            what is known brings into the world, -1 stands for scans alone. Nothing is
+            known of how two components lie.
         graph: every pair that was registered, `T_i_j` in the input's frames and unit,
             of the mode that agrees with the other pairs, of the best mode if none does;
             prior weight the overlap where it is trusted and else 0.
