@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core import control
 from jaxreg._core.checks import TRACED
 from jaxreg._core.platforms import by_platform
 
@@ -43,6 +44,13 @@ def full_matmul(a: Float[Array, "i j"], b: Float[Array, "j l"]) -> Float[Array, 
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
+def weighted_sums(
+    rows: Float[Array, "r n"], weight: Float[Array, " n"]
+) -> Float[Array, " r"]:
+    """Of each row: one product, where XLA on a CPU compiles three parts of each sum."""
+    return full_matmul(rows, weight[:, None])[:, 0]
+
+
 def cast_floats(tree: Tree, dtype: Any) -> Tree:
     """Casts every floating array of a pytree, so that no setting promotes the data."""
 
@@ -73,6 +81,11 @@ def on_both(function: Callable[[Tree], Out], a: Tree, b: Tree) -> tuple[Out, Out
     return jax.tree.map(lambda x: x[0], out), jax.tree.map(lambda x: x[1], out)
 
 
+def rows_of(x: Array, rows: Int[Array, "..."], axis: int = 0) -> Array:
+    """Rows that are known to be there: `x[rows]` tests each for being negative."""
+    return jnp.take(x, rows, axis=axis, mode="clip")
+
+
 def spread_rows(
     mask: Bool[Array, " n"], num: int
 ) -> tuple[Int[Array, " r"], Bool[Array, " r"]]:
@@ -93,9 +106,24 @@ def place_among(
     ascending: Array, wanted: Array, side: Literal["left", "right"] = "left"
 ) -> Array:
     """`jnp.searchsorted`: by halves on a CPU, by one sort on an accelerator."""
+    return by_platform(
+        lambda: _place_by_halves(ascending, wanted, side),
+        lambda: jnp.searchsorted(ascending, wanted, side=side, method="sort").astype(
+            jnp.int32
+        ),
+    )
 
-    def by(method: str) -> Array:
-        found = jnp.searchsorted(ascending, wanted, side=side, method=method)
-        return found.astype(jnp.int32)
 
-    return by_platform(lambda: by("scan"), lambda: by("sort"))
+def _place_by_halves(ascending: Array, wanted: Array, side: str) -> Array:
+    """Bit by bit: how many are less; a third of what JAX's own takes to compile."""
+    num = len(ascending)
+
+    def with_bit(k: Array, place: Array) -> Array:
+        trial = place + (1 << (bits - 1 - k))
+        last = rows_of(ascending, trial - 1)
+        less = last < wanted if side == "left" else last <= wanted
+        return jnp.where((trial <= num) & less, trial, place)
+
+    bits = num.bit_length()
+    start = jnp.zeros(wanted.shape, jnp.int32)
+    return control.fori_loop(0, bits, with_bit, start)

@@ -41,6 +41,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
@@ -166,7 +167,8 @@ class Likelihood(eqx.Module):
         none = jax.nn.softplus(prior)
         near_ways, meant = _near_ways(graph, T_i_j, self.scale, alone)  # (t, e)
         both_sides = jnp.concatenate([near_ways, ~near_ways]).astype(sq.dtype)
-        allowed = log_odds[:, None] >= jnp.maximum(log_odds, 0)[None]  # near, far
+        # Of near and far edges.
+        allowed = np.asarray(_LOG_ODDS)[:, None] >= np.maximum(_LOG_ODDS, 0)[None]
         reach = _reach(graph.dim)
 
         def log_gain(deviation: Array) -> tuple[Array, Array]:
@@ -181,13 +183,13 @@ class Likelihood(eqx.Module):
             sums = jnp.matmul(each, both_sides.T, precision=jax.lax.Precision.HIGHEST)
             near, far = jnp.split(sums, 2, axis=1)
             both = near[:, None] + far[None]  # near, far, t
-            may = allowed[..., None] & meant[None, None]
+            may = jnp.asarray(allowed)[..., None] & meant[None, None]
             return jnp.where(may, both, -jnp.inf) - self.free * most
 
         ladder = jnp.asarray(deviations, sq.dtype)
         every = jax.lax.map(terms, ladder)
-        count = len(deviations) * jnp.sum(meant) * jnp.sum(allowed)
-        s, near, far, t = _place(jnp.argmax(every), every.shape)
+        count = len(deviations) * np.sum(allowed) * jnp.sum(meant)
+        s, near, far, t = _places(every.shape)[:, jnp.argmax(every)]
         p = jnp.where(near_ways[t], log_odds[near], log_odds[far])
         right = p + weigh + log_gain(ladder[s])[0]
         ratio = jax.nn.logsumexp(every) - jnp.log(count.astype(sq.dtype))
@@ -239,13 +241,9 @@ def _reach(dim: int) -> float:
     return (turns * ball) ** (1 / k) / math.sqrt(2 * math.pi)
 
 
-def _place(at: Int[Array, ""], shape: tuple[int, ...]) -> list[Int[Array, ""]]:
-    """The row along each axis of a number in an array."""
-    rows: list[Array] = []
-    for size in reversed(shape):
-        rows.append(jax.lax.rem(at, jnp.asarray(size, at.dtype)))
-        at = jax.lax.div(at, jnp.asarray(size, at.dtype))
-    return rows[::-1]
+def _places(shape: tuple[int, ...]) -> Int[Array, "axes size"]:
+    """Where each number of an array is, read off: divisions would be a part each."""
+    return jnp.asarray(np.indices(shape).reshape(len(shape), -1), jnp.int32)
 
 
 def _near_ways(

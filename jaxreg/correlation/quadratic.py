@@ -89,7 +89,7 @@ def _wrench(
     lever: Float[Array, "d n"], force: Float[Array, "d n"]
 ) -> Float[Array, "k n"]:
     """A force and its torque."""
-    return jnp.stack([*force, *cross(lever, force)])
+    return jnp.concatenate([force, cross(lever, force)])
 
 
 def _constant(vector: Float[Array, " d"], like: Array) -> Array:

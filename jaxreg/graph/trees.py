@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.arrays import rows_of
 from jaxreg.geometry import lie
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.small import product
@@ -48,13 +49,13 @@ def components(
     Labels spread along edges and are then followed to their own label (pointer
     jumping), so that long chains take a logarithmic number of rounds.
     """
-    i, j = edges[:, 0], edges[:, 1]
-    present = weight > 0
+    present = (weight > 0)[:, None]
 
     def spread(state: tuple[Array, Array]) -> tuple[Array, Array]:
         label, _ = state
-        low = jnp.where(present, jnp.minimum(label[i], label[j]), num_poses)
-        new = label.at[label[i]].min(low).at[label[j]].min(low)
+        ends = rows_of(label, edges)
+        low = jnp.where(present, jnp.min(ends, axis=1, keepdims=True), num_poses)
+        new = label.at[ends].min(jnp.broadcast_to(low, ends.shape))
         new = new[new]
         return new[new], jnp.any(new != label)
 
@@ -106,37 +107,33 @@ def _join_components(
 ) -> _Boruvka:
     """One round: each component hooks onto another through its best edge."""
     num_poses, num_edges = state.component.shape[0], edges.shape[0]
-    i, j = edges[:, 0], edges[:, 1]
-    ci, cj = state.component[i], state.component[j]
-    leaving = (ci != cj) & (weight > 0)
-    w = jnp.where(leaving, weight, 0)
-    best_weight = jnp.zeros((num_poses,), w.dtype).at[ci].max(w).at[cj].max(w)
-    order = jnp.arange(num_edges, dtype=jnp.int32)
-
-    def first(c: Array) -> Array:
-        return jnp.where(leaving & (w == best_weight[c]), order, num_edges)
-
-    best = jnp.full((num_poses,), num_edges, jnp.int32)
-    best = best.at[ci].min(first(ci)).at[cj].min(first(cj))
+    ends = rows_of(state.component, edges)  # components, (e, 2)
+    leaving = ((ends[:, 0] != ends[:, 1]) & (weight > 0))[:, None]
+    w = jnp.broadcast_to(jnp.where(leaving, weight[:, None], 0), ends.shape)
+    best_weight = jnp.zeros((num_poses,), w.dtype).at[ends].max(w)
+    order = jnp.arange(num_edges, dtype=jnp.int32)[:, None]
+    first = jnp.where(leaving & (w == rows_of(best_weight, ends)), order, num_edges)
+    best = jnp.full((num_poses,), num_edges, jnp.int32).at[ends].min(first)
     found = best < num_edges
     e = jnp.where(found, best, 0)
     frames = jnp.arange(num_poses, dtype=jnp.int32)
-    outward = ci[e] == frames
-    other = jnp.where(outward, cj[e], ci[e])
+    own, across = jnp.unstack(rows_of(ends, e), axis=1)
+    outward = own == frames
+    other = jnp.where(outward, across, own)
     # Of two components that chose the same edge, the smaller id becomes the root.
     mutual = found & found[other] & (best[other] == best) & (frames < other)
     hooks = found & ~mutual
     parent = jnp.where(hooks, other, frames)
-    X_i, X_j = state.T_root_i[i[e]], state.T_root_i[j[e]]
-    T_ri_rj = product(product(X_i, T_i_j[e]), lie.inverse(X_j))
+    X_i, X_j = jnp.unstack(rows_of(state.T_root_i, rows_of(edges, e)), axis=1)
+    T_ri_rj = product(product(X_i, rows_of(T_i_j, e)), lie.inverse(X_j))
     T_parent_c = jnp.where(outward[:, None, None], lie.inverse(T_ri_rj), T_ri_rj)
     eye = jnp.eye(T_i_j.shape[-1], dtype=T_i_j.dtype)
     T_parent_c = jnp.where(hooks[:, None, None], T_parent_c, eye[None])
     root, T_top_c = follow(parent, T_parent_c)
     in_tree = state.in_tree.at[jnp.where(hooks, best, num_edges)].set(True, mode="drop")
     return _Boruvka(
-        root[state.component],
-        product(T_top_c[state.component], state.T_root_i),
+        rows_of(root, state.component),
+        product(rows_of(T_top_c, state.component), state.T_root_i),
         in_tree,
         jnp.any(hooks),
     )
@@ -154,7 +151,7 @@ def follow(
 
     def jump(state: tuple[Array, Array]) -> tuple[Array, Array]:
         up, T = state
-        return up[up], product(T[up], T)
+        return rows_of(up, up), product(rows_of(T, up), T)
 
     def unfinished(state: tuple[Array, Array]) -> Array:
         return jnp.any(state[0] != state[0][state[0]])

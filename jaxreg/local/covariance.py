@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core import control
-from jaxreg._core.arrays import full_matmul, place_among
+from jaxreg._core.arrays import full_matmul, place_among, weighted_sums
 from jaxreg._core.typing import Motion
 from jaxreg.linear.small import eigh
 from jaxreg.local.optimiser import LocalOptimiser
@@ -208,8 +208,9 @@ def _reach(
     found: Match, weight: Float[Array, " n"], width: Float[Array, ""]
 ) -> Float[Array, ""]:
     """Half the interval of slopes; of matches without error, one above rounding."""
-    total = jnp.sum(weight)
-    sq = jnp.sum(weight * found.plane_residual**2) / jnp.where(total > 0, total, 1)
+    sq = found.plane_residual**2
+    total, sq = weighted_sums(jnp.stack([jnp.ones_like(sq), sq]), weight)
+    sq = sq / jnp.where(total > 0, total, 1)
     return jnp.maximum(jnp.sqrt(3 * sq), 1e-3 * width)
 
 

@@ -6,6 +6,7 @@ from jaxreg.matching.evidence import Evidence as Evidence
 from jaxreg.matching.evidence import Witness as Witness
 from jaxreg.matching.problem import Match as Match
 from jaxreg.matching.problem import Problem as Problem
+from jaxreg.matching.problem import known as known
 from jaxreg.matching.problem import match as match
 from jaxreg.matching.problem import moved as moved
 from jaxreg.matching.residuals import AbstractResidual as AbstractResidual

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxreg._core.typing import Scalar
 from jaxreg.cloud import PointCloud
-from jaxreg.matching.problem import Problem, match
+from jaxreg.matching.problem import Problem, known, match
 from jaxreg.neighbours import AbstractIndex
 
 
@@ -52,14 +52,15 @@ def near_by_chance(cloud: PointCloud, index: AbstractIndex) -> Scalar:
     step = jnp.arange(len(some.mask), dtype=dtype) * _STEP
     height = ZONE * (2 * (step - jnp.floor(step)) - 1)
     away = (height * spacing)[:, None] * some.normals
-    flat = some.mask & jnp.any(some.normals != 0, axis=1)
+    flat = some.mask & known(some.normals.T)
     room = PointCloud(some.points + away, some.normals, flat)
     found = match(Problem.of(room, cloud, index), jnp.eye(4, dtype=dtype))
     reach = jnp.maximum(spacing, cloud.spacing[found.row])
     over = jnp.abs(found.plane_residual)
     along = found.sq_residual - over**2
     beside = flat & (along < reach**2) & (over < ZONE * reach)
-    near = jnp.sum(beside & (over < reach)) / jnp.maximum(jnp.sum(beside), 1)
+    near, num = jnp.sum(jnp.stack([beside & (over < reach), beside]), axis=1)
+    near = near / jnp.maximum(num, 1)
     beyond = jnp.clip((near - _OF_SCANS) / (1 - _OF_SCANS), 0, 1)
     chance = surfaces + beyond * (1 - surfaces)
     return jnp.minimum(chance, _MOST).astype(dtype)

@@ -144,11 +144,12 @@ class Witness(eqx.Module):
         source, target = levelled(source.with_spacing(), target.with_spacing())
         if source.spacing is None or target.spacing is None:
             raise ValueError("Witness: clouds without spacings.")
-        (own, here), (other, there) = on_both(
-            lambda side: (balanced(side[0]), near_by_chance(*side)),
+        (own, here, a), (other, there, b) = on_both(
+            lambda side: (balanced(side[0]), near_by_chance(*side), _radius(side[0])),
             (source, source_index),
             (target, target_index),
         )
+        radius = jnp.minimum(a, b)
         return cls(
             (
                 Problem.of(source, target, target_index),
@@ -157,7 +158,7 @@ class Witness(eqx.Module):
             (source.spacing, target.spacing),
             (own, other),
             jnp.minimum(here, there),
-            _smaller_radius(source, target),
+            jnp.where(radius > 0, radius, 1),
         )
 
     @classmethod
@@ -219,19 +220,18 @@ def _one_way(
     beside = Beside.of(found, own, other)
     mixture = Mixture.fitted(beside, balance, chance, problem.source.shape[0])
     gain, on = mixture.gain(beside, balance)
-    near = jnp.sum(beside.near)
     moved = found.rotated + lie.translation(T_target_source)[:, None]
     before = _num_before(problem, moved, beside, found.mask)
-    num = jnp.sum(on)
-    total = jnp.maximum(jnp.sum(found.mask), 1)
-    said = jnp.sum(beside.part) + _AGAINST * before
     sq = jnp.where(on, (beside.height * beside.reach) ** 2, 0)
+    each = jnp.stack([beside.near, beside.part, sq, on, found.mask])
+    near, said, sq, num, total = jnp.sum(each, axis=1)
+    total = jnp.maximum(total, 1)
     return _Way(
-        overlap=near / total.astype(gain.dtype),
-        near=near / jnp.maximum(said, 1),
+        overlap=near / total,
+        near=near / jnp.maximum(said + _AGAINST * before, 1),
         gain=gain,
-        fitness=(num / total).astype(gain.dtype),
-        rmse=_root(jnp.sum(sq) / jnp.maximum(num, 1)),
+        fitness=num / total,
+        rmse=_root(sq / jnp.maximum(num, 1)),
         num=num.astype(jnp.int32),
         grip=Grip.of(found, moved, on),
     )
@@ -258,16 +258,11 @@ def _of_both(
     )
 
 
-def _smaller_radius(source: PointCloud, target: PointCloud) -> Scalar:
+def _radius(cloud: PointCloud) -> Scalar:
     """Of half the points: a lidar that sees far has few of its points there."""
-
-    def radius(cloud: PointCloud) -> Scalar:
-        away = cloud.points - centroid(cloud.points, cloud.mask)[None]
-        sq = jnp.sum(jnp.where(cloud.mask[:, None], away, 0) ** 2, axis=1)
-        return _root(masked_quantile(sq, cloud.mask, 0.5))
-
-    least = jnp.minimum(radius(source), radius(target))
-    return jnp.where(least > 0, least, 1)
+    away = cloud.points - centroid(cloud.points, cloud.mask)[None]
+    sq = jnp.sum(jnp.where(cloud.mask[:, None], away, 0) ** 2, axis=1)
+    return _root(masked_quantile(sq, cloud.mask, 0.5))
 
 
 def _root(x: Float[Array, "*q"]) -> Float[Array, "*q"]:

@@ -12,9 +12,10 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
+from jaxreg._core.arrays import weighted_sums
 from jaxreg._core.typing import Scalar
 from jaxreg.matching.chance import ZONE
-from jaxreg.matching.problem import Match
+from jaxreg.matching.problem import Match, known
 
 
 # Steps of the mixture, and the bounds of its width and concentration: exact data have
@@ -60,8 +61,7 @@ class Beside(eqx.Module):
     ) -> "Beside":
         """Of a match, and the spacings of both clouds."""
         reach = jnp.maximum(own, other[found.row])
-        flat = jnp.any(found.normal != 0, axis=0)
-        flat = flat & jnp.any(found.source_normal != 0, axis=0)
+        flat = known(found.normal) & known(found.source_normal)
         height = jnp.where(flat, jnp.abs(found.plane_residual), 0)
         along = found.sq_residual - height**2
         # The root of zero has no finite slope.
@@ -141,13 +141,15 @@ class Mixture(eqx.Module):
         weight = beside.part * balance
         total = _positive(jnp.sum(weight))
         half = (d - 1) / 2
+        told = jnp.ones_like(weight), beside.height**2, -beside.log_cosine
+        told = jnp.stack(told)
 
         def improve(_: Array, now: Array) -> Array:
             mixture = cls(now[0], now[1], now[2], chance, d)
             part = weight * jax.nn.sigmoid(mixture.log_odds(beside))
-            some = _positive(jnp.sum(part))
-            sq_width = jnp.sum(part * beside.height**2) / some
-            apart = jnp.sum(part * -beside.log_cosine) / some
+            some, sq_width, apart = weighted_sums(told, part)
+            some = _positive(some)
+            sq_width, apart = sq_width / some, apart / some
             alike = half / jnp.maximum(apart, half / (2 * _MOST_ALIKE)) - half
             share = jnp.clip(some / total, _LEAST_SHARE, 1 - _LEAST_SHARE)
             width = jnp.sqrt(jnp.clip(sq_width, _LEAST_WIDTH**2, 1))
@@ -159,9 +161,7 @@ class Mixture(eqx.Module):
 
     def log_odds(self, beside: Beside) -> Float[Array, " n"]:
         """Of each point lying on the surface."""
-        k, half = self.alike, self.d / 2
-        log_mean = gammaln((k + 1) / 2) - gammaln(k / 2 + half)
-        log_mean = log_mean + gammaln(half) - gammaln(0.5)
+        k, log_mean = self.alike, _log_mean_of_power(self.alike, self.d)
         beyond = (1 - self.chance) / (2 * (ZONE - 1))
         anywhere = jnp.where(beside.height < 1, self.chance / 2, beyond)
         log_scale = -jnp.log(math.sqrt(2 * math.pi) * self.width * anywhere)
@@ -176,5 +176,12 @@ class Mixture(eqx.Module):
         odds = self.log_odds(beside)
         weight = beside.part * balance
         gain = jax.nn.softplus(odds) + jnp.log1p(-self.share)
-        mean = jnp.sum(weight * gain) / _positive(jnp.sum(weight))
-        return mean, beside.mask & (odds > 0)
+        said, weight = jnp.sum(jnp.stack([weight * gain, weight]), axis=1)
+        return said / _positive(weight), beside.mask & (odds > 0)
+
+
+def _log_mean_of_power(k: Scalar, d: int) -> Scalar:
+    """The logarithm of the mean of |cos|^k over all directions."""
+    if d == 3:
+        return -jnp.log1p(k)
+    return gammaln((k + 1) / 2) - gammaln(k / 2 + 1) - gammaln(0.5)

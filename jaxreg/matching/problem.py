@@ -13,6 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxreg._core.arrays import rows_of
 from jaxreg._core.typing import Motion, Scalar
 from jaxreg.cloud import Frames, PointCloud, RangeImage
 from jaxreg.geometry import lie
@@ -167,23 +168,19 @@ class Match(eqx.Module):
 
 
 def inner(a: Float[Array, "d n"], b: Float[Array, "d n"]) -> Float[Array, " n"]:
-    """Inner products of columns, row by row: faster than a reduction of length 3."""
-    terms = (x * y for x, y in zip(jnp.unstack(a), jnp.unstack(b), strict=True))
-    return functools.reduce(operator.add, terms)
+    """Inner products of columns, by terms: faster than a reduction of length 3."""
+    return functools.reduce(operator.add, jnp.unstack(a * b))
+
+
+def known(normals: Float[Array, "d n"]) -> Bool[Array, " n"]:
+    """Which of these columns are unit normals, and not zero."""
+    return inner(normals, normals) > 0
 
 
 def rotate(R: Float[Array, "d d"], columns: Float[Array, "d n"]) -> Float[Array, "d n"]:
-    """R times columns, in full precision and unrolled."""
-    return jnp.stack(_rotated(R, columns))
-
-
-def _rotated(R: Float[Array, "d d"], columns: Array) -> list[Float[Array, " n"]]:
-    rows = jnp.unstack(columns)
-    terms = [
-        [x * row for x, row in zip(jnp.unstack(of), rows, strict=True)]
-        for of in jnp.unstack(R)
-    ]
-    return [functools.reduce(operator.add, each) for each in terms]
+    """R times columns, in full precision: an axis of R after the other."""
+    axes = zip(jnp.unstack(R, axis=1), jnp.unstack(columns), strict=True)
+    return functools.reduce(operator.add, (x[:, None] * row[None] for x, row in axes))
 
 
 def match(
@@ -203,21 +200,17 @@ def match(
     """
     d = problem.source.shape[0]
     R, t = lie.rotation(T_target_source), lie.translation(T_target_source)
-    # Row by row: XLA vectorises no loop over rows that were stacked before their use.
-    turned = _rotated(R, problem.source)
-    moved = [x + shift for x, shift in zip(turned, jnp.unstack(t), strict=True)]
+    moved = rotate(R, problem.source) + t[:, None]
     if row is None:
-        row = problem.index.lookup(jnp.stack(moved), num, coarse)
+        row = problem.index.lookup(moved, num, coarse)
     if problem.soft is None or width is None:
-        found = [problem.target[k][row] for k in range(2 * d)]
+        found = rows_of(problem.target, row, axis=1)
     else:
-        found = problem.soft.blended(problem.target, jnp.stack(moved), row, width)
-    residual = jnp.stack([found[k] - moved[k] for k in range(d)])
-    normal = jnp.stack([found[d + k] for k in range(d)])
+        found = problem.soft.blended(problem.target, moved, row, width)
+    residual, normal = found[:d] - moved, found[d:]
     cosine = inner(problem.source_normals, rotate(R.T, normal))
-    known = inner(normal, normal) > 0
-    known = known & jnp.any(problem.source_normals != 0, axis=0)
-    agreement = jnp.where(known, cosine * cosine, 1)
+    both = known(normal) & known(problem.source_normals)
+    agreement = jnp.where(both, cosine * cosine, 1)
     agreement = jnp.where(problem.source_mask, agreement, 0)
     return Match(
         problem.source,

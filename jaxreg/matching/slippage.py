@@ -6,11 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core.arrays import weighted_sums
 from jaxreg._core.typing import Motions, Scalar
 from jaxreg.geometry import lie
 from jaxreg.linear import small
-from jaxreg.matching.problem import Match
-from jaxreg.matching.residuals import PointToPlane, PointToPoint
+from jaxreg.matching.problem import Match, known
+from jaxreg.matching.residuals.metric import identity, metric_equations, outer
 
 
 # Planes that the gentlest motion by one radian, or radius, moves less than this many
@@ -46,11 +47,13 @@ class Grip(eqx.Module):
         """Of the points in `share`, where they are in the frame of the normals."""
         eye = jnp.eye(len(points), dtype=points.dtype)
         found = eqx.tree_at(lambda m: (m.source, m.R), found, (points, eye))
-        weight = share.astype(points.dtype)
-        flat = jnp.any(found.normal != 0, axis=0)
-        H, _ = PointToPlane(0.0).normal_equations(found, weight * flat)
-        H = H + PointToPoint().normal_equations(found, weight * ~flat)[0]
-        return cls(H, jnp.sum(weight[None] * points, axis=1), jnp.sum(weight))
+        weight, normal = share.astype(points.dtype), found.normal
+        points_alone = identity(len(points), points.dtype)
+        metric = jnp.where(known(normal)[None], outer(normal), points_alone)
+        H, _ = metric_equations(found, weight, metric, jnp.zeros_like(points))
+        rows = jnp.concatenate([points, jnp.ones_like(points[:1])])
+        sums = weighted_sums(rows, weight)
+        return cls(H, sums[:-1], sums[-1])
 
     def seen_from(self, T_to_here: Motions) -> "Grip":
         """In another frame."""

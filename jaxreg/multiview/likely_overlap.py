@@ -17,7 +17,7 @@ from jaxreg._core.typing import Scalar
 from jaxreg.batching.padding import rounded_up
 from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.geometry import lie
-from jaxreg.matching import Match, match
+from jaxreg.matching import Match, known, match
 from jaxreg.multiview.choose_pairs import all_pairs, ascending, pair_keys
 from jaxreg.multiview.in_blocks import in_blocks
 from jaxreg.multiview.place import Placement
@@ -160,7 +160,7 @@ def _overlap(
 
 def _near(found: Match, spacing: Scalar) -> Scalar:
     """The share of the points that may be of the other surface."""
-    flat = jnp.any(found.normal != 0, axis=0)
+    flat = known(found.normal)
     near = (found.sq_residual < (_DRIFT * spacing) ** 2) & found.mask
     near = near & (~flat | (jnp.abs(found.plane_residual) < spacing))
     share = jnp.sum(near) / jnp.maximum(jnp.sum(found.mask), 1)

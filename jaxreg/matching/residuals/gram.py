@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxreg.linear import small
 from jaxreg.matching.problem import Match, inner
 
 
@@ -39,15 +40,11 @@ def weighted_gram(
     return jnp.matmul(rows * weight[None], rows.T, precision=lax.Precision.HIGHEST)
 
 
-def cross(a: Float[Array, "d n"], b: Float[Array, "d n"]) -> list[Float[Array, " n"]]:
+def cross(a: Float[Array, "d n"], b: Float[Array, "d n"]) -> Float[Array, "r n"]:
     """Rows of a cross b: three in 3D, the one that is not zero in 2D."""
-    if a.shape[0] == 2:
-        return [a[0] * b[1] - a[1] * b[0]]
-    return [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
+    if a.shape[0] == 3:
+        return small.cross(a, b, axis=0)
+    return a[:1] * b[1:] - a[1:] * b[:1]
 
 
 def along(direction: Float[Array, "d n"], match: Match) -> Float[Array, "k1 n"]:
@@ -55,13 +52,13 @@ def along(direction: Float[Array, "d n"], match: Match) -> Float[Array, "k1 n"]:
 
     Their Gram matrix holds H, and b in its last column.
     """
-    turn = cross(match.rotated, direction)
-    return jnp.stack([*direction, *turn, inner(direction, match.residual)])
+    height = inner(direction, match.residual)[None]
+    return jnp.concatenate([wrench(direction, match), height])
 
 
 def wrench(force: Float[Array, "d n"], match: Match) -> Float[Array, "k n"]:
     """Rows (f, x cross f): what the forces on the points do to the pose."""
-    return jnp.stack([*force, *cross(match.rotated, force)])
+    return jnp.concatenate([force, cross(match.rotated, force)])
 
 
 def half_sum(

@@ -5,8 +5,6 @@ for all poses, so that the sums of many particles are one matrix product, which 
 third of the time of one for each particle.
 """
 
-import itertools
-from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,8 +18,8 @@ from jaxreg.matching.problem import Match
 def metric_equations(
     match: Match,
     weight: Float[Array, " n"],
-    metric: Sequence[Float[Array, " n"]],
-    force: Sequence[Float[Array, " n"]],
+    metric: Float[Array, "t n"],
+    force: Float[Array, "d n"],
 ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
     """H and b for the tangent (v, w), see `AbstractResidual`.
 
@@ -33,9 +31,9 @@ def metric_equations(
     """
     p, R = match.source, match.R
     d, number = len(p), len(metric)
-    products = [a * b for a, b in _each_two([jnp.ones_like(p[0]), *p])]
-    rows = jnp.stack([weight * x for x in (*metric, *force)])
-    sums = full_matmul(rows, jnp.stack(products).T)
+    products = outer(jnp.concatenate([jnp.ones_like(p[:1]), p]))
+    rows = weight[None] * jnp.concatenate([metric, force])
+    sums = full_matmul(rows, products.T)
     # Sums of M_ij p_b p_c with 1 as p_0, at row (i, b) and column (j, c).
     spread = sums[:number][_places(d)][..., _places(d + 1)]
     spread = jnp.swapaxes(spread, 1, 2).reshape(d * (d + 1), -1)
@@ -44,26 +42,20 @@ def metric_equations(
     return full_matmul(full_matmul(K, spread), K.T), full_matmul(K, pull)[:, 0]
 
 
-def outer(rows: Float[Array, "d n"]) -> list[Float[Array, " n"]]:
+def outer(rows: Float[Array, "d n"]) -> Float[Array, "t n"]:
     """The upper triangle of each column's product with itself, row by row."""
-    return [a * b for a, b in _each_two(list(rows))]
+    return jnp.concatenate([rows[i : i + 1] * rows[i:] for i in range(len(rows))])
 
 
-def identity(d: int) -> list[float]:
+def identity(d: int, dtype: Any) -> Float[Array, "t 1"]:
     """The upper triangle of the identity, row by row."""
-    return [float(a == b) for a, b in _each_two(range(d))]
-
-
-def _each_two(rows: Sequence[Any]) -> list[tuple[Any, Any]]:
-    """Each with itself and with those behind it: an upper triangle row by row."""
-    return list(itertools.combinations_with_replacement(rows, 2))
+    return jnp.asarray(np.eye(d)[np.triu_indices(d)][:, None], dtype)
 
 
 def _places(num: int) -> np.ndarray:
     """Where each entry of a symmetric matrix is in its upper triangle."""
-    places = np.zeros((num, num), int)
-    for at, (i, j) in enumerate(_each_two(range(num))):
-        places[i, j] = places[j, i] = at
+    places, (i, j) = np.zeros((num, num), int), np.triu_indices(num)
+    places[i, j] = places[j, i] = np.arange(len(i))
     return places
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_positive
-from jaxreg.matching.problem import Match, inner, rotate
+from jaxreg.matching.problem import Match, inner, known, rotate
 from jaxreg.matching.residuals.base import AbstractResidual
 from jaxreg.matching.residuals.gram import half_sum, wrench
 from jaxreg.matching.residuals.metric import identity, metric_equations, outer
@@ -46,13 +46,10 @@ class PlaneToPlane(AbstractResidual):
     ) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
         """Of the metric M."""
         axes = self._axes(match)
-        planes = (
-            [stiffness * x for x in outer(rotate(match.R.T, direction))]
-            for direction, stiffness in axes
-        )
-        points = identity(len(match.residual))
-        metric = [x / 2 + s + a for x, s, a in zip(points, *planes, strict=True)]
-        return metric_equations(match, weight, metric, list(_force(match, axes)))
+        metric = identity(len(match.residual), weight.dtype) / 2
+        for direction, stiffness in axes:
+            metric = metric + stiffness[None] * outer(rotate(match.R.T, direction))
+        return metric_equations(match, weight, metric, _force(match, axes))
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
         """The wrench of M r."""
@@ -68,8 +65,8 @@ class PlaneToPlane(AbstractResidual):
     def _axes(self, match: Match) -> list[tuple[Array, Array]]:
         """Directions s and a, and c / (4 l) of each."""
         p, q = match.source_normal, match.normal
-        p = jnp.where(jnp.any(p != 0, axis=0, keepdims=True), p, q)
-        q = jnp.where(jnp.any(q != 0, axis=0, keepdims=True), q, p)
+        p = jnp.where(known(p)[None], p, q)
+        q = jnp.where(known(q)[None], q, p)
         c = 1 - jnp.asarray(self.epsilon, q.dtype)
         cosine = inner(p, q)
         return [

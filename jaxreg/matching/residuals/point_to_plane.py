@@ -36,13 +36,12 @@ class PointToPlane(AbstractResidual):
         """Of the metric n n^T + point_share I."""
         share = jnp.asarray(self.point_share, weight.dtype)
         normal = rotate(match.R.T, match.normal)
-        planes = zip(outer(normal), identity(len(normal)), strict=True)
-        metric = [plane + share * point for plane, point in planes]
+        metric = outer(normal) + share * identity(len(normal), normal.dtype)
         return metric_equations(match, weight, metric, self._force(match))
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
         """The wrench of (n . r) n plus the share of r."""
-        return wrench(jnp.stack(self._force(match)), match)
+        return wrench(self._force(match), match)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w ((n . r)^2 + point_share |r|^2) / 2."""
@@ -50,7 +49,6 @@ class PointToPlane(AbstractResidual):
         plane = match.plane_residual
         return half_sum(plane * plane + share * match.sq_residual, weight)
 
-    def _force(self, match: Match) -> list[Float[Array, " n"]]:
-        n, r, height = match.normal, match.residual, match.plane_residual
-        share = jnp.asarray(self.point_share, r.dtype)
-        return [height * n[k] + share * r[k] for k in range(len(r))]
+    def _force(self, match: Match) -> Float[Array, "d n"]:
+        share = jnp.asarray(self.point_share, match.residual.dtype)
+        return match.plane_residual[None] * match.normal + share * match.residual

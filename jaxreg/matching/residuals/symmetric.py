@@ -50,8 +50,8 @@ class Symmetric(AbstractResidual):
 
 def _rows(match: Match) -> Float[Array, "k1 n"]:
     p, n, r = _source_normal(match), _normal_sum(match), match.residual
-    turn = [a + b for a, b in zip(cross(match.rotated, n), cross(r, p), strict=True)]
-    return jnp.stack([*n, *turn, inner(n, r)])
+    turn = cross(match.rotated, n) + cross(r, p)
+    return jnp.concatenate([n, turn, inner(n, r)[None]])
 
 
 def _source_normal(match: Match) -> Float[Array, "d n"]:

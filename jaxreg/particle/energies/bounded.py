@@ -8,7 +8,7 @@ from jaxtyping import Array
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_not_negative, check_positive
 from jaxreg._core.typing import Scalar
-from jaxreg.matching import Match
+from jaxreg.matching import Match, known
 from jaxreg.particle.energies.base import AbstractEnergy
 
 
@@ -50,7 +50,7 @@ class BoundedEnergy(AbstractEnergy):
     def __call__(self, found: Match, width: Scalar) -> Scalar:
         """The share of the source that has no counterpart or a wrong one, softly."""
         sq = found.sq_residual
-        flat = jnp.any(found.normal != 0, axis=0)
+        flat = known(found.normal)
         height_sq = jnp.where(flat, found.plane_residual**2, sq)
         slide, narrow = (jnp.asarray(x, sq.dtype) for x in (self.slide, self.narrow))
         along_sq = jnp.maximum(sq - height_sq, 0)
