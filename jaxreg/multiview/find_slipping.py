@@ -12,12 +12,11 @@ from jaxtyping import Array, Bool, Int
 from jaxreg._core import control
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
-from jaxreg.batching.side_by_side import map_side_by_side
-from jaxreg.geometry import lie
 from jaxreg.graph.joined import joined
 from jaxreg.graph.trees import components
-from jaxreg.matching import Grip
+from jaxreg.matching import Evidence, Grip
 from jaxreg.multiview.in_blocks import in_blocks
+from jaxreg.multiview.pair_evidence import pair_evidence
 from jaxreg.multiview.parts import in_main_body
 from jaxreg.multiview.place import Placement
 from jaxreg.multiview.prepared_scans import PreparedScans
@@ -41,7 +40,8 @@ def slipping(
     """
 
     def run(block: Array) -> Grip:
-        return _grips(scans, placement, block, least)
+        told = pair_evidence(scans, placement, block)
+        return _grips(placement, block, told, least)
 
     grips = in_blocks(run, pairs, (scans, placement))
     body = jnp.arange(scans.num_scans, dtype=jnp.int32)
@@ -52,24 +52,16 @@ def slipping(
 
 @kept_program
 def _grips(
-    scans: PreparedScans,
-    placement: Placement,
-    pairs: Int[Array, "b 2"],
-    least: Scalar,
+    placement: Placement, pairs: Int[Array, "b 2"], told: Evidence, least: Scalar
 ) -> Grip:
     """Of every pair that is likely, in the world's frame; nothing of the others."""
-    T_world_i = placement.T_world_i
 
-    def one(pair: Array) -> Grip:
-        i, j = pair
-        T_i_j = lie.between(T_world_i[i], T_world_i[j])
-        witness = scans.witness(i, j)
-        found = witness.of_pose(T_i_j)
-        use = (found.contact >= least) & placement.together(i, j) & (i != j)
-        grip = jax.tree.map(lambda x: jnp.where(use, x, 0), found.grip)
-        return grip.seen_from(T_world_i[i])
+    def where_likely(x: Array) -> Array:
+        use = jnp.expand_dims(told.contact >= least, tuple(range(1, x.ndim)))
+        return jnp.where(use, x, 0)
 
-    return map_side_by_side(one, pairs, scans.num_rows)
+    grips = jax.tree.map(where_likely, told.grip)
+    return grips.seen_from(placement.T_world_i[pairs[:, 0]])
 
 
 @kept_program

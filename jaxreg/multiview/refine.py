@@ -21,9 +21,10 @@ from jaxreg.averaging import MCC, AbstractAverager, SpanningTree
 from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
-from jaxreg.matching import NO_EVIDENCE, Evidence, PlaneToPlane
+from jaxreg.matching import Evidence, PlaneToPlane
 from jaxreg.multiview.follow_points import follow_points
 from jaxreg.multiview.in_blocks import in_blocks
+from jaxreg.multiview.pair_evidence import pair_evidence
 from jaxreg.multiview.parts import first_where, in_main_body, part_sizes
 from jaxreg.multiview.place import Placement, place
 from jaxreg.multiview.prepared_scans import PreparedScans
@@ -108,7 +109,8 @@ def measured(
     """The motion and overlap of pairs of a part near the present poses, m = 1."""
 
     def run(block: Array) -> RelativeMotions:
-        return _measured(scans, placement, least, block, exact=exact)
+        told = pair_evidence(scans, placement, block)
+        return _measured(scans, placement, least, block, told, exact=exact)
 
     motions = in_blocks(run, pairs, (scans, placement))
     return eqx.tree_at(lambda m: m.pairs, motions, pairs)
@@ -120,35 +122,30 @@ def _measured(
     placement: Placement,
     least: Scalar,
     pairs: Int[Array, "b 2"],
+    told: Evidence,
     *,
     exact: bool,
 ) -> RelativeMotions:
     T_world_i = placement.T_world_i
-    widths = widths_of(scans, placement, exact=exact)
-    optimiser, zero = optimiser_of(T_world_i), jnp.zeros((), T_world_i.dtype)
+    widths, optimiser = (
+        widths_of(scans, placement, exact=exact),
+        optimiser_of(T_world_i),
+    )
 
-    def measured(pair: Array) -> Motion:
-        i, j = pair
-        problem = scans.problem(i, j, exact=exact)
-        T_i_j = lie.between(T_world_i[i], T_world_i[j])
+    def measured(pair: Array, T_i_j: Motion) -> Motion:
+        problem = scans.problem(pair[0], pair[1], exact=exact)
         return lie.straightened(optimiser.repeat(problem, T_i_j, widths))
 
-    def one(pair: Array) -> RelativeMotions:
-        i, j = pair
-        T_i_j = lie.between(T_world_i[i], T_world_i[j])
-        overlap, told, rmse = control.cond(
-            placement.together(i, j) & (i != j),
-            lambda: _told(scans.witness(i, j).of_pose(T_i_j)),
-            lambda: (zero, zero + NO_EVIDENCE, zero),
+    def one(of: tuple[Array, Scalar]) -> Motion:
+        pair, log_evidence = of
+        T_i_j = lie.between(T_world_i[pair[0]], T_world_i[pair[1]])
+        return control.cond(
+            log_evidence >= least, measured, lambda _, T: T, pair, T_i_j
         )
-        T_i_j = control.cond(told >= least, measured, lambda _: T_i_j, pair)
-        return RelativeMotions(pair, T_i_j[None], overlap[None], told[None], rmse[None])
 
-    return map_side_by_side(one, pairs, scans.num_rows)
-
-
-def _told(found: Evidence) -> tuple[Scalar, Scalar, Scalar]:
-    return found.overlap, found.log_evidence, found.inlier_rmse
+    T_i_j = map_side_by_side(one, (pairs, told.log_evidence), scans.num_rows)
+    each = T_i_j, told.overlap, told.log_evidence, told.inlier_rmse
+    return RelativeMotions(pairs, *(x[:, None] for x in each))
 
 
 def optimiser_of(like: Array) -> LocalOptimiser:
