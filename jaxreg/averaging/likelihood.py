@@ -242,7 +242,7 @@ def _reach(dim: int) -> float:
 
 
 def _places(shape: tuple[int, ...]) -> Int[Array, "axes size"]:
-    """Where each number of an array is, read off: divisions would be a part each."""
+    """Where each number of an array is, read off, not divided out."""
     return jnp.asarray(np.indices(shape).reshape(len(shape), -1), jnp.int32)
 
 

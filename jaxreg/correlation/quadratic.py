@@ -16,7 +16,7 @@ from jaxreg._core.typing import Motion
 from jaxreg.cloud import PointCloud
 from jaxreg.correlation.pairs import PairSums, pair_sums
 from jaxreg.geometry import lie
-from jaxreg.matching.residuals.gram import cross
+from jaxreg.matching.residuals.gram import wrench
 
 
 class Quadratic(eqx.Module):
@@ -52,12 +52,12 @@ class Quadratic(eqx.Module):
         moved = lie.act(T_target_source, source.points).T
         lever = moved - lie.translation(T_target_source)[:, None]
         sums = pair_sums(moved, source.mask, target.points, target.mask, bandwidth)
-        by_source = _wrench(lever, sums.pull)
+        by_source = wrench(sums.pull, lever)
 
         eye = jnp.eye(d, dtype=lever.dtype)
         values = eye[:, :, None] * sums.value[None, None]
         # Rows e_i . d(R p + t) / d(v, w), `(d, k, n)`.
-        J = jnp.stack([_wrench(lever, _constant(row, lever)) for row in eye])
+        J = jnp.stack([wrench(_constant(row, lever), lever) for row in eye])
         pairs_H = values - sums.spread / bandwidth**2
         H = _quadratic_form(J, pairs_H) + _bending(lever, sums)
         stiffness = jnp.sum(jnp.sum(J * J, axis=0) * sums.value[None], axis=1)
@@ -82,14 +82,7 @@ def pull_on_target(
     moved = lie.act(T_target_source, source.points)
     at = target.points.T
     sums = pair_sums(at, target.mask, moved, source.mask, bandwidth)
-    return _wrench(at - lie.translation(T_target_source)[:, None], -sums.pull)
-
-
-def _wrench(
-    lever: Float[Array, "d n"], force: Float[Array, "d n"]
-) -> Float[Array, "k n"]:
-    """A force and its torque."""
-    return jnp.concatenate([force, cross(lever, force)])
+    return wrench(-sums.pull, at - lie.translation(T_target_source)[:, None])
 
 
 def _constant(vector: Float[Array, " d"], like: Array) -> Array:

@@ -59,8 +59,7 @@ def near_by_chance(cloud: PointCloud, index: AbstractIndex) -> Scalar:
     over = jnp.abs(found.plane_residual)
     along = found.sq_residual - over**2
     beside = flat & (along < reach**2) & (over < ZONE * reach)
-    near, num = jnp.sum(jnp.stack([beside & (over < reach), beside]), axis=1)
-    near = near / jnp.maximum(num, 1)
+    near = jnp.sum(beside & (over < reach)) / jnp.maximum(jnp.sum(beside), 1)
     beyond = jnp.clip((near - _OF_SCANS) / (1 - _OF_SCANS), 0, 1)
     chance = surfaces + beyond * (1 - surfaces)
     return jnp.minimum(chance, _MOST).astype(dtype)

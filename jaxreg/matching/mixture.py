@@ -141,8 +141,8 @@ class Mixture(eqx.Module):
         weight = beside.part * balance
         total = _positive(jnp.sum(weight))
         half = (d - 1) / 2
-        told = jnp.ones_like(weight), beside.height**2, -beside.log_cosine
-        told = jnp.stack(told)
+        each = jnp.ones_like(weight), beside.height**2, -beside.log_cosine
+        told = jnp.stack(each)
 
         def improve(_: Array, now: Array) -> Array:
             mixture = cls(now[0], now[1], now[2], chance, d)

@@ -127,10 +127,8 @@ def _measured(
     exact: bool,
 ) -> RelativeMotions:
     T_world_i = placement.T_world_i
-    widths, optimiser = (
-        widths_of(scans, placement, exact=exact),
-        optimiser_of(T_world_i),
-    )
+    widths = widths_of(scans, placement, exact=exact)
+    optimiser = optimiser_of(T_world_i)
 
     def measured(pair: Array, T_i_j: Motion) -> Motion:
         problem = scans.problem(pair[0], pair[1], exact=exact)

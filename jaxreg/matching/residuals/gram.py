@@ -53,12 +53,14 @@ def along(direction: Float[Array, "d n"], match: Match) -> Float[Array, "k1 n"]:
     Their Gram matrix holds H, and b in its last column.
     """
     height = inner(direction, match.residual)[None]
-    return jnp.concatenate([wrench(direction, match), height])
+    return jnp.concatenate([wrench(direction, match.rotated), height])
 
 
-def wrench(force: Float[Array, "d n"], match: Match) -> Float[Array, "k n"]:
+def wrench(
+    force: Float[Array, "d n"], lever: Float[Array, "d n"]
+) -> Float[Array, "k n"]:
     """Rows (f, x cross f): what the forces on the points do to the pose."""
-    return jnp.concatenate([force, cross(match.rotated, force)])
+    return jnp.concatenate([force, cross(lever, force)])
 
 
 def half_sum(

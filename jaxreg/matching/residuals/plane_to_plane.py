@@ -53,7 +53,7 @@ class PlaneToPlane(AbstractResidual):
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
         """The wrench of M r."""
-        return wrench(_force(match, self._axes(match)), match)
+        return wrench(_force(match, self._axes(match)), match.rotated)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w r^T M r / 2."""

@@ -41,7 +41,7 @@ class PointToPlane(AbstractResidual):
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
         """The wrench of (n . r) n plus the share of r."""
-        return wrench(self._force(match), match)
+        return wrench(self._force(match), match.rotated)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w ((n . r)^2 + point_share |r|^2) / 2."""

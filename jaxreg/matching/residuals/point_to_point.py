@@ -44,7 +44,7 @@ class PointToPoint(AbstractResidual):
 
     def descents(self, match: Match) -> Float[Array, "k n"]:
         """The wrench of r."""
-        return wrench(match.residual, match)
+        return wrench(match.residual, match.rotated)
 
     def energy(self, match: Match, weight: Float[Array, " n"]) -> Float[Array, ""]:
         """Sum of w |r|^2 / 2."""
