@@ -86,6 +86,15 @@ def test_the_next_process_does_not_trace(store: Path):
     assert again.name == "a"
 
 
+def test_answers_are_on_a_device_for_good_where_what_was_given_is(store: Path):
+    usual, put = jnp.arange(3.0), jax.device_put(jnp.arange(3.0), jax.devices()[0])
+    told, _ = _traced(usual, Huber(), 2.0)
+    assert not told.value["x"].committed
+    assert told.value["x"].dtype == usual.dtype
+    told, _ = _traced(put, Huber(), 2.0)
+    assert told.value["x"].committed
+
+
 def test_whatever_the_answer_depends_on_has_its_own_program(store: Path):
     x = jnp.arange(3, dtype=jnp.int32)
     calls: list[Any] = [

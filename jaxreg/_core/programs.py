@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.platforms import platform_of, traced_for
@@ -81,9 +82,13 @@ class _Program(NamedTuple):
 
     run: Callable[..., Any]
     skeleton: Any  # the answer with holes for arrays
+    platform: str
 
     def __call__(self, args: Any, kwargs: Any) -> Any:
-        leaves = self.run(*jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array)))
+        given = jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array))
+        leaves = self.run(*given)
+        if self.platform == "cpu" and not any(map(_is_committed, given)):
+            leaves = list(map(_uncommitted, leaves))
         holes, rest = eqx.partition(self.skeleton, lambda x: isinstance(x, Hole))
         return eqx.combine(jax.tree.unflatten(jax.tree.structure(holes), leaves), rest)
 
@@ -143,7 +148,7 @@ class _Store:
                 return None
             self._write(path, *found)
         exported, skeleton = found
-        return _Program(jax.jit(exported.call), skeleton)
+        return _Program(jax.jit(exported.call), skeleton, platform)
 
     def _write(self, path: Path, exported: Any, skeleton: Any) -> None:
         """A folder that takes nothing is told of once."""
@@ -169,6 +174,21 @@ def _is_usual(x: Any, platform: str) -> bool:
         return False
     devices = x.devices() if isinstance(x, jax.Array) else ()
     return len(devices) < 2 and {d.platform for d in devices} <= {platform}
+
+
+def _is_committed(x: Any) -> bool:
+    return isinstance(x, jax.Array) and x.committed
+
+
+def _uncommitted(x: jax.Array) -> jax.Array:
+    """On no device for good, as the answers of programs that are traced.
+
+    JAX commits what exported programs give; what is then given both ways is compiled
+    twice. By NumPy nothing is copied on a CPU.
+    """
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    traced = not is_concrete(x)  # within a program of the user
+    return x if is_key or traced else jax.device_put(np.asarray(x))
 
 
 def _settings(platform: str) -> tuple[str, ...] | None:

@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.arrays import cast_floats, full_matmul
+from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import ArrayLike
 from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
@@ -173,7 +174,7 @@ class _Surfaces(eqx.Module):
         return code % num, sign
 
 
-@eqx.filter_jit
+@kept_program
 def _covariances(
     scans: PreparedScans,
     T_first_i: Float[Array, "v D D"],
