@@ -90,9 +90,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names need not be UTF-8
     try:
-        code = _run(arguments)
-        sys.stdout.flush()  # what is not written now would fail behind Python's end
-        return code
+        try:
+            return _run(arguments)
+        finally:  # help exits, too, and what is not written now fails at Python's end
+            sys.stdout.flush()
     except (InputError, MissingExtraError) as err:
         sys.stderr.write(f"jaxreg: {printable(str(err))}\n")
         return 2

@@ -90,12 +90,15 @@ main.command()
     assert done.stderr == "jaxreg: interrupted; no results were written.\n"
 
 
-def test_a_reader_who_leaves_is_no_error():
+@pytest.mark.parametrize("columns", ["40", "200"])  # of more text than a buffer, less
+def test_a_reader_who_leaves_is_no_error(columns: str):
     read, write = os.pipe()
     os.close(read)
+    usual = {x: os.environ[x] for x in ("PATH", "PYTHONPATH") if x in os.environ}
     with os.fdopen(write, "w") as pipe:
         command = [sys.executable, "-m", "jaxreg", "--help"]
-        done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE)
+        env = {**usual, "COLUMNS": columns}
+        done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, env=env)
     assert (done.returncode, done.stderr) == (141, b"")
 
 
