@@ -46,10 +46,12 @@ from .matching import PointToPlane as PointToPlane
 from .matching import PointToPoint as PointToPoint
 from .matching import SoftMatches as SoftMatches
 from .matching import Symmetric as Symmetric
+from .multiview import AveragedPairs as AveragedPairs
 from .multiview import ReconstructionSolution as ReconstructionSolution
 from .multiview import RelativeMotions as RelativeMotions
 from .multiview import ScanPositions as ScanPositions
 from .multiview import ScanSet as ScanSet
+from .multiview import joint_scan_covariances as joint_scan_covariances
 from .multiview import reconstruct as reconstruct
 from .multiview import scan_covariances as scan_covariances
 from .neighbours import AbstractIndex as AbstractIndex

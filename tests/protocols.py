@@ -170,6 +170,7 @@ FUNCTIONS = {
     "reconstruct",
     "correspondences",
     "pose_covariances",
+    "joint_scan_covariances",
     "scan_covariances",
     "certify",
     "edge_report",

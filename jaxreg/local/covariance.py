@@ -174,15 +174,23 @@ def answer(
     found: Match,
     width: Float[Array, ""],
     weight: Float[Array, " n"],
+    H: Float[Array, "k k"],
 ) -> Float[Array, "k k"]:
-    """A of `pose_covariance`, from some points displaced to both sides."""
-    reach = _reach(found, weight, width)
+    """A of `pose_covariance`, from some points displaced to both sides.
+
+    Some points tell how far A is from H, which all points tell: A of a few hundred by
+    itself is as much too small in some directions as it is too large in others. Half
+    the interval of `pose_covariance`: matches of one that is found from the poses of
+    all jump less, and over the whole of it slopes are a tenth too small.
+    """
+    reach = _reach(found, weight, width) / 2
     few, some = _some(problem, _PROBES)
     moved = match(_displaced(few, reach), T_target_source)
     pulls = optimiser.residual.descents(moved) * optimiser.weights(moved, width)[None]
-    A = _answer(pulls, found.of_rows(some), reach)
-    asked = jnp.sum(weight[some] * few.source_mask)
-    return jnp.sum(weight) / jnp.where(asked > 0, asked, 1) * A
+    rest, counted = found.of_rows(some), weight[some] * few.source_mask
+    A, asked = _answer(pulls, rest, reach), jnp.sum(counted)
+    H_few, _ = optimiser.residual.normal_equations(rest, counted)
+    return H + jnp.sum(weight) / jnp.where(asked > 0, asked, 1) * (A - H_few)
 
 
 def _told(
@@ -257,11 +265,21 @@ def _some(
     return eqx.tree_at(lambda p: p.source_mask, few, present), rows
 
 
-def inverse_within(
-    A: Float[Array, "k k"], H: Float[Array, "k k"]
-) -> Float[Array, "k k"]:
-    """A^-1 in the directions that H holds, with A from 0.01 to 1 times H."""
-    return _inverse(A, _whitening(H))
+def after_steps(
+    A: Float[Array, "k k"], H: Float[Array, "k k"], num: int
+) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
+    """What Gauss-Newton steps make of pulls g and of a displacement x at the start.
+
+    Steps x <- x + H^-1 (g - A x) lead to (1 - S) x + G g. In the directions that H
+    holds, with A from 0.01 to 1 times H; where A is little, few steps lead nowhere.
+
+    Returns:
+        G, which is A^-1 where A is large, and S.
+    """
+    white, share = _shares(A, _whitening(H))
+    undone = 1 - (1 - share) ** num
+    gain = full_matmul(white * (undone / share)[None], white.T)
+    return gain, full_matmul(full_matmul(white * undone[None], white.T), H)
 
 
 def _whitening(H: Float[Array, "k k"]) -> Float[Array, "k k"]:
@@ -275,9 +293,14 @@ def _whitening(H: Float[Array, "k k"]) -> Float[Array, "k k"]:
 
 
 def _inverse(A: Float[Array, "k k"], white: Float[Array, "k k"]) -> Float[Array, "k k"]:
-    """That of `inverse_within`, given the `_whitening` of H."""
-    share = full_matmul(white.T, full_matmul(A, white))
-    value, vector = eigh(share)
-    white = full_matmul(white, vector)
-    share = jnp.clip(value, _LEAST_ANSWER, 1)
+    """A^-1 in the directions that H holds, given the `_whitening` of H."""
+    white, share = _shares(A, white)
     return full_matmul(white / share[None], white.T)
+
+
+def _shares(
+    A: Float[Array, "k k"], white: Float[Array, "k k"]
+) -> tuple[Float[Array, "k k"], Float[Array, " k"]]:
+    """Directions W with W^T H W = I in which A is diagonal, from 0.01 to 1 times H."""
+    value, vector = eigh(full_matmul(white.T, full_matmul(A, white)))
+    return full_matmul(white, vector), jnp.clip(value, _LEAST_ANSWER, 1)

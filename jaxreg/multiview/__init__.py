@@ -1,5 +1,9 @@
 """Many scans into one frame."""
 
+from jaxreg.multiview.averaged_pairs import AveragedPairs as AveragedPairs
+from jaxreg.multiview.covariances import (
+    joint_scan_covariances as joint_scan_covariances,
+)
 from jaxreg.multiview.covariances import scan_covariances as scan_covariances
 from jaxreg.multiview.positions import ScanPositions as ScanPositions
 from jaxreg.multiview.reconstruct import reconstruct as reconstruct

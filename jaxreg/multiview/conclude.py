@@ -11,6 +11,7 @@ from jaxreg._core.typing import Scalar
 from jaxreg.averaging import AbstractAverager
 from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
+from jaxreg.multiview.averaged_pairs import AveragedPairs
 from jaxreg.multiview.find_slipping import slipping
 from jaxreg.multiview.find_turnable import turnable
 from jaxreg.multiview.hold_poses import Held
@@ -62,18 +63,20 @@ def finish(
     likely = least - _VOUCHED
     if hold is not None:
         pairs = hold.of_new(pairs)
-        placement = hold.refine(scans, placement, averaging, likely, pairs)
+        placement, averaged = hold.refine(scans, placement, averaging, likely, pairs)
         free = turns | slipping(scans, placement, least, pairs, hold.held)
         free = free & ~hold.held
-        solution = _solution(scans, motions, mode, placement, free, least)
+        told = placement, averaged, free, least
+        solution = _solution(scans, motions, mode, *told)
         return hold.in_world(solution)
-    placement, measured = refine(moving, placement, averaging, likely, pairs)
+    refined = refine(moving, placement, averaging, likely, pairs)
+    placement, measured, averaged = refined
     free = turns | slipping(scans, placement, least, pairs)
     if known is None:
-        return _solution(moving, motions, mode, placement, free, least)
+        return _solution(moving, motions, mode, placement, averaged, free, least)
     placement, trust = known.place(scans, placement, measured, averaging, likely)
     free = free & ~known.fixed
-    solution = _solution(moving, motions, mode, placement, free, least)
+    solution = _solution(moving, motions, mode, placement, averaged, free, least)
     return eqx.tree_at(
         lambda s: s.prior_weight, solution, trust, is_leaf=lambda x: x is None
     )
@@ -85,6 +88,7 @@ def _solution(
     motions: RelativeMotions,
     mode: Int[Array, " e"],
     placement: Placement,
+    averaged: AveragedPairs,
     free: Bool[Array, " v"],
     least: Scalar,
 ) -> ReconstructionSolution:
@@ -122,6 +126,7 @@ def _solution(
         inlier_rmse=one.inlier_rmse[:, 0],
         mode=mode,
         motions=found,
+        averaged=averaged,
         num_dropped=scans.num_dropped,
         trace=None if trace is None else trace.in_unit(scans.radius),
     )

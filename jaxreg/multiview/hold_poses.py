@@ -17,6 +17,7 @@ from jaxreg.averaging import AbstractAverager
 from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.matching import NO_EVIDENCE
+from jaxreg.multiview.averaged_pairs import AveragedPairs
 from jaxreg.multiview.place import Placement, agreeing, place
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import measured, wide_unless_given
@@ -34,11 +35,13 @@ class Held(eqx.Module):
         held: `(v,)` which scans stay.
         node: `(v,)` int32, 0 for these, and a number for each other scan; one more for
             the padding.
+        averaged: the pairs that these rest on.
     """
 
     T_world_i: Float[Array, "v D D"]
     held: Bool[Array, " v"]
     node: Int[Array, " v"]
+    averaged: AveragedPairs
 
     @classmethod
     def of(cls, previous: ReconstructionSolution, scans: PreparedScans) -> "Held":
@@ -52,7 +55,8 @@ class Held(eqx.Module):
         others = np.cumsum(~held & np.asarray(scans.present))
         node = np.where(np.asarray(scans.present), others, np.max(others) + 1)
         node = np.where(held, 0, node).astype(np.int32)
-        return cls(jnp.asarray(T), jnp.asarray(held), jnp.asarray(node))
+        told = jnp.asarray(T), jnp.asarray(held), jnp.asarray(node)
+        return cls(*told, previous.averaged)
 
     def of_new(self, pairs: Int[Array, "p 2"]) -> Int[Array, "q 2"]:
         """Those of them that have to be measured: not those of scans that stay."""
@@ -109,8 +113,10 @@ class Held(eqx.Module):
         averaging: AbstractAverager | None,
         least: Scalar,
         pairs: Int[Array, "p 2"],
-    ) -> Placement:
+    ) -> tuple[Placement, AveragedPairs]:
         """The others by pairs measured anew, beside those that stay.
+
+        Also what these count for, beside the pairs that those which stay rest on.
 
         Args:
             scans: prepared scans.
@@ -123,10 +129,11 @@ class Held(eqx.Module):
         count = jnp.max(jnp.where(scans.present, self.node, 0)) + 1
         for exact in (False, True):
             motions = measured(scans, placed, least, pairs, exact=exact)
-            motions = _contracted(self, placed, motions)
-            nodes = place(motions, self._num_nodes, averaging, least, count)
+            of_nodes = _contracted(self, placed, motions)
+            nodes = place(of_nodes, self._num_nodes, averaging, least, count)
             placed = _expanded(self, scans.present, placed, nodes)
-        return placed
+        new = AveragedPairs.of(motions, nodes, least)
+        return placed, self.averaged.beside(new)
 
     @property
     def _num_nodes(self) -> int:

@@ -22,6 +22,7 @@ from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import Evidence, PlaneToPlane
+from jaxreg.multiview.averaged_pairs import AveragedPairs
 from jaxreg.multiview.follow_points import follow_points
 from jaxreg.multiview.in_blocks import in_blocks
 from jaxreg.multiview.pair_evidence import pair_evidence
@@ -35,8 +36,8 @@ from jaxreg.robust import GemanMcClure
 # Kernel widths in sample spacings: first by the voxel tables, then by exact search.
 _TABLE_WIDTHS = (1.4, 1.2, 1.0, 0.8, 0.7, 0.7)
 _EXACT_WIDTHS = (0.7, 0.7, 0.5, 0.5, 0.35, 0.35, 0.35, 0.35)
-#: Of the last step.
-WIDTH_END = _EXACT_WIDTHS[-1]
+#: Of the last step, and how many lead there from the poses of all.
+WIDTH_END, NUM_STEPS = _EXACT_WIDTHS[-1], len(_EXACT_WIDTHS)
 
 
 def refine(
@@ -45,7 +46,7 @@ def refine(
     averaging: AbstractAverager | None,
     least: Scalar,
     pairs: Int[Array, "p 2"],
-) -> tuple[Placement, RelativeMotions]:
+) -> tuple[Placement, RelativeMotions, AveragedPairs]:
     """Poses from pairs of placed scans that overlap, measured anew.
 
     They have derivatives by the points of the scans: of the last round, which matches
@@ -59,21 +60,23 @@ def refine(
         pairs: those that may overlap (`near_pairs`).
 
     Returns:
-        The placement by these pairs, and the pairs. Scans that no pair holds any more
-        keep their poses, but are alone.
+        The placement by these pairs, the pairs, and what each counted for. Scans that
+        no pair holds any more keep their poses, but are alone.
     """
     averaging = wide_unless_given(averaging)
     moving, scans = scans, lax.stop_gradient(scans)
 
     def averaged(motions: RelativeMotions) -> Placement:
-        again = place(motions, scans.num_scans, averaging, least, scans.count)
-        return _updated(placement, again)
+        return place(motions, scans.num_scans, averaging, least, scans.count)
 
-    placement = averaged(measured(scans, placement, least, pairs, exact=False))
+    motions = measured(scans, placement, least, pairs, exact=False)
+    placement = _updated(placement, averaged(motions))
     motions = measured(scans, placement, least, pairs, exact=True)
     optimiser, width = optimiser_of(motions.T_i_j), widths_of(moving, placement)[-1]
     motions = follow_points(moving, motions, optimiser, width, least)
-    return averaged(motions), motions
+    average = averaged(motions)
+    counted = AveragedPairs.of(motions, average, least)
+    return _updated(placement, average), motions, counted
 
 
 def wide_unless_given(averaging: AbstractAverager | None) -> AbstractAverager:

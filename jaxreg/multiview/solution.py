@@ -13,6 +13,7 @@ from jaxreg._core.status import Status, counted
 from jaxreg._core.typing import StatusArray
 from jaxreg.averaging import AveragingTrace
 from jaxreg.graph import PoseGraph
+from jaxreg.multiview.averaged_pairs import AveragedPairs
 from jaxreg.multiview.relative_motions import RelativeMotions
 
 
@@ -49,6 +50,8 @@ class ReconstructionSolution(eqx.Module):
         inlier_rmse: `(e,)` distance of that share, in the unit of the input.
         mode: `(e,)` int32, which of the pair's modes that is, 0 the best.
         motions: every mode of every pair, in the input's frames and unit.
+        averaged: the pairs that the poses rest on in the end, found by the search or
+            not; their motions were measured anew.
         num_dropped: `(v,)` rows that were not finite.
         trace: how the averaging that chose the pairs came to rest, lengths in the unit
             of the input; None if its method takes no steps.
@@ -68,6 +71,7 @@ class ReconstructionSolution(eqx.Module):
     inlier_rmse: Float[Array, " e"]
     mode: Int[Array, " e"]
     motions: RelativeMotions
+    averaged: AveragedPairs
     num_dropped: Int[Array, " v"]
     trace: AveragingTrace | None = None
     prior_weight: Float[Array, " p"] | None = None

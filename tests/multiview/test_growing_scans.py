@@ -124,6 +124,15 @@ def test_new_scans_lie_beside_those_that_are_held():
     np.testing.assert_array_equal(after.T_world_i[:4], before.T_world_i)
     T = np.linalg.inv(T_WORLD[0]) @ T_WORLD[4]
     assert pose_error(after.T_world_i[4], T)[0] < 0.02
+    # All poses rest on pairs, those that are held on those that they rested on.
+    weights = [
+        dict(zip(map(tuple, x.pairs.tolist()), x.weight.tolist(), strict=True))
+        for x in (before.averaged, after.averaged)
+    ]
+    assert weights[0].items() <= weights[1].items()
+    new = {pair: w for pair, w in weights[1].items() if w > 0 and 4 in pair}
+    assert new
+    assert np.isfinite(jr.scan_covariances(SCANS[:5], after)).all()
 
 
 def test_in_a_round_pairs_of_two_that_stay_count_as_their_poses_have_them():

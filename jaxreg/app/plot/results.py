@@ -11,7 +11,7 @@ from jaxreg._core.status import Status
 from jaxreg.app.result import Result
 
 
-MAX_COVARIANCES = 300  # poses; the matrix of all is dense
+MAX_COVARIANCES = 300  # poses; more ellipsoids than these show nothing
 
 
 def result_of(

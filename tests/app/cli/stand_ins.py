@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxreg
-from jaxreg import Status
+from jaxreg import AveragedPairs, Status
 from jaxreg.registrar import Modes
 
 
@@ -117,6 +117,7 @@ def fake_reconstruct(
             inlier_rmse=zeros,
             mode=jnp.zeros(len(edges), int),
             motions=jaxreg.RelativeMotions(graph.edges, *modes),
+            averaged=AveragedPairs(graph.edges, overlap),
             num_dropped=jnp.asarray(dropped),
             prior_weight=jnp.ones(len(told)) if in_world else None,
         )

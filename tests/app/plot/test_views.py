@@ -11,7 +11,7 @@ import pytest
 from helpers import blob, motion, move
 
 import jaxreg
-from jaxreg import Status
+from jaxreg import AveragedPairs, Status
 from jaxreg.app import views
 from jaxreg.registrar import Modes
 
@@ -60,6 +60,7 @@ def _reconstruction() -> jaxreg.ReconstructionSolution:
         inlier_rmse=0.01 * ones,
         mode=jnp.zeros(3, jnp.int32),
         motions=jaxreg.RelativeMotions(GRAPH.edges, GRAPH.T_i_j[:, None], *one),
+        averaged=AveragedPairs(GRAPH.edges, 0.5 * ones),
         num_dropped=jnp.zeros(3, jnp.int32),
     )
 
