@@ -16,7 +16,7 @@ from jaxreg.linear import laplacian
 from jaxreg.local.covariance import answer
 from jaxreg.local.steps import turn_and_shift
 from jaxreg.matching.problem import match
-from jaxreg.multiview import covariances, follow_motions
+from jaxreg.multiview import follow_motions, surface_errors
 from jaxreg.multiview.given_scans import GivenScans
 from jaxreg.multiview.refine import WIDTH_END, optimiser_of
 
@@ -186,7 +186,7 @@ def test_of_many_scans_covariances_are_those_of_few(found, monkeypatch):
     scans, _, sol = found
     C = np.asarray(jr.scan_covariances(scans, sol, relative_to=3))
     monkeypatch.setattr(laplacian, "DENSE_LIMIT", 2)
-    monkeypatch.setattr(covariances, "_MOST", 512)
+    monkeypatch.setattr(surface_errors, "_MOST", 512)
     jax.clear_caches()
     again = np.asarray(jr.scan_covariances(scans, sol, relative_to=3))
     assert not again[3].any()
