@@ -256,6 +256,7 @@ WORKLOADS = {
         "Gradients of a sum over the answer beside the answer itself, float64, and how "
         "far a derivative is off what it must be.",
         double=True,
+        quick=False,
     ),
     "solvers": Workload(
         "Our steps and other solvers",
