@@ -178,8 +178,9 @@ def answer(
 ) -> Float[Array, "k k"]:
     """A of `pose_covariance`, from some points displaced to both sides.
 
-    Some points tell how far A is from H, which all points tell: A of a few hundred by
-    itself is as much too small in some directions as it is too large in others. Half
+    Some points tell which share of their H it is, and how it differs from that: of a
+    few hundred A is as much too small in some directions as it is too large in others,
+    and so is H of the same points, which all tell. Half
     the interval of `pose_covariance`: matches of one that is found from the poses of
     all jump less, and over the whole of it slopes are a tenth too small.
     """
@@ -190,7 +191,10 @@ def answer(
     rest, counted = found.of_rows(some), weight[some] * few.source_mask
     A, asked = _answer(pulls, rest, reach), jnp.sum(counted)
     H_few, _ = optimiser.residual.normal_equations(rest, counted)
-    return H + jnp.sum(weight) / jnp.where(asked > 0, asked, 1) * (A - H_few)
+    of_all = jnp.sum(weight) / jnp.where(asked > 0, asked, 1)
+    top = jnp.trace(H_few)
+    share = jnp.trace(A) / jnp.where(top > 0, top, 1)
+    return share * H + of_all * (A - share * H_few)
 
 
 def _told(
