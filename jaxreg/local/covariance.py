@@ -28,6 +28,9 @@ _LEAST_ANSWER = 0.01
 # Target points in a cell: about as many as a normal is estimated from. Of large clouds
 # more: as many cells as this tell a variance within an eighth.
 _CELL, _MOST_CELLS = 8, 128
+# Parts of the target of some cells each: as few as tell a variance within a third along
+# one axis, an eighth in the mean over six.
+_PATCHES = 16
 # Poses around the answer, half of them the other half turned over.
 _AROUND = 8
 _SIGNS = np.random.default_rng(0).choice([-1.0, 1.0], (_AROUND // 2, _MOST_CELLS))
@@ -53,8 +56,10 @@ def pose_covariance(
     * B is the covariance of the sum. Source points that share a target point share its
       error, neighbours share errors of their normals, and along the border of a partial
       overlap all err to one side. So terms are summed over cells of some target points
-      before they are squared (Liang and Zeger 1986). Nothing is assumed about the size
-      of the errors.
+      before they are squared (Liang and Zeger 1986). Real scans are warped, too, and
+      err alike over wider parts: B is raised by how much larger, in the mean over its
+      axes, it is of sums over patches of cells. Nothing is assumed about the size of
+      the errors.
     * A is minus the derivative of the sum, with the closest points found anew and
       weighed anew: those that noise brought near answer less to a motion than H, which
       holds matches and weights, says (a fifth as much at a noise of 0.4 sample
@@ -90,7 +95,7 @@ def pose_covariance(
     """
     T, white = T_target_source, _whitening(H)
     pulls = optimiser.residual.descents(found) * weight[None]
-    reach, cell = _reach(found, weight, width), _cells(problem)
+    reach, (cell, patch) = _reach(found, weight, width), _cells(problem)
     at_root = _summed(pulls, cell[found.row])
 
     def around(number: Array, state: tuple[_Sums, Array]) -> tuple[_Sums, Array]:
@@ -122,8 +127,8 @@ def pose_covariance(
     start = _Sums(zero, zero, zero), zero
     (_, there, here), inverse = control.fori_loop(0, 1 + _AROUND, around, start)
     # Of all points as much as of those that were asked, in deviations of the pose.
-    asked = jnp.sum(here * inverse) / _AROUND
-    growth = jnp.sum(_scatter(at_root) * inverse) / jnp.where(asked > 0, asked, 1)
+    asked, shared = jnp.sum(here * inverse) / _AROUND, _shared(at_root, patch, inverse)
+    growth = shared / jnp.where(asked > 0, asked, 1)
     return full_matmul(inverse, full_matmul(growth / _AROUND * there, inverse))
 
 
@@ -153,18 +158,34 @@ def _scatter(pulls: Float[Array, "c k"]) -> Float[Array, "k k"]:
     return full_matmul(pulls.T, pulls)
 
 
-def _cells(problem: Problem) -> Int[Array, " m"]:
-    """Of each target point the closest of those chosen by their place in the order.
+def _shared(
+    at_root: Float[Array, "c k"], patch: Int[Array, " c"], inverse: Float[Array, "k k"]
+) -> Float[Array, ""]:
+    """B of the cells in the mean over its axes, or of patches where that is larger.
 
-    So cells are the same however the clouds are turned, moved or padded.
+    Patches sum to zero at the root, so one of them tells nothing.
+    """
+    wide = jax.ops.segment_sum(at_root, patch, _PATCHES)
+    own, wide = (jnp.sum(_scatter(x) * inverse) for x in (at_root, wide))
+    return jnp.maximum(own, _PATCHES / (_PATCHES - 1) * wide)
+
+
+def _cells(problem: Problem) -> tuple[Int[Array, " m"], Int[Array, " c"]]:
+    """The cell of each target point, and the patch of each cell.
+
+    Of the closest of points chosen by their place in the order, and of every eighth of
+    these. So they are the same however the clouds are turned, moved or padded.
     """
     mask, d = problem.index.mask, problem.source.shape[0]
     num = jnp.cumsum(mask)
     place = jnp.maximum(_CELL, -(-num[-1] // _MOST_CELLS)) * jnp.arange(_MOST_CELLS)
     chosen = jnp.minimum(place_among(num, place + 1), len(mask) - 1)
     points = problem.target[:d]
-    seeds = BruteForce.build(points[:, chosen].T, place < num[-1])
-    return seeds.lookup(points)
+    seeds, present = points[:, chosen], place < num[-1]
+    few = slice(None, None, _MOST_CELLS // _PATCHES)
+    cells = BruteForce.build(seeds.T, present)
+    patches = BruteForce.build(seeds[:, few].T, present[few])
+    return cells.lookup(points), patches.lookup(seeds)
 
 
 def answer(
@@ -178,11 +199,11 @@ def answer(
 ) -> Float[Array, "k k"]:
     """A of `pose_covariance`, from some points displaced to both sides.
 
-    Some points tell which share of their H it is, and how it differs from that: of a
-    few hundred A is as much too small in some directions as it is too large in others,
-    and so is H of the same points, which all tell. Half
-    the interval of `pose_covariance`: matches of one that is found from the poses of
-    all jump less, and over the whole of it slopes are a tenth too small.
+    A of a few hundred points is too small in some directions and too large in others,
+    and so is their H. So they tell which share of their H it is, and how it differs
+    from that; all points tell H. The interval of the slopes is half of that in
+    `pose_covariance`: over the whole of it they are a tenth too small for motions that
+    were found from the poses of all.
     """
     reach = _reach(found, weight, width) / 2
     few, some = _some(problem, _PROBES)

@@ -73,6 +73,22 @@ def test_unit_of_the_input_scales_curvature_and_covariance(near):
         np.testing.assert_allclose(of_mode, getattr(mm, field), rtol=1e-5)
 
 
+def test_errors_that_wide_parts_share_widen_the_region(near):
+    _, _, T, _, _ = near
+    scan = sculpture_scans(1, seed=1, points_per_scan=M)[0][0][:M]
+    scan = (scan - scan.mean(axis=0)) / 0.05
+    target, source = scan, scan[:N]
+    # Along every axis as large, once in waves over the object, once here and there.
+    waves = 0.03 * np.sin(3 * source[:, [1, 2, 0]]).astype(np.float32)
+    sizes = []
+    for off in (waves, np.random.default_rng(0).permutation(waves)):
+        given = move(np.linalg.inv(T), source + off)
+        sol = jr.register(given, target, jr.ICP(), init=T)
+        assert pose_error(sol.T_target_source, T)[0] < 0.05
+        sizes.append(np.sqrt(np.trace(sol.covariance[3:, 3:])))
+    assert sizes[0] > 1.5 * sizes[1]
+
+
 def test_covariance_is_that_of_the_pair_however_it_is_padded(near):
     source, target, _, init, sol = near
     # Rows that count for nothing, before the others and behind.
