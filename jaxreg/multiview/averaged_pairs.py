@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxreg._core.programs import kept_program
@@ -38,8 +39,10 @@ class AveragedPairs(eqx.Module):
         return cls(motions.pairs, jax.lax.stop_gradient(weight))
 
     def beside(self, other: "AveragedPairs") -> "AveragedPairs":
-        """These and others."""
-        return jax.tree.map(lambda *x: jnp.concatenate(x), self, other)
+        """These and others, without padding; outside of `jit`."""
+        every = jax.tree.map(lambda *x: np.concatenate(x), self, other)
+        real = every.pairs[:, 0] != every.pairs[:, 1]
+        return jax.tree.map(lambda x: jnp.asarray(x[real]), every)
 
 
 @kept_program

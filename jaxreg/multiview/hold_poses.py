@@ -35,13 +35,11 @@ class Held(eqx.Module):
         held: `(v,)` which scans stay.
         node: `(v,)` int32, 0 for these, and a number for each other scan; one more for
             the padding.
-        averaged: the pairs that these rest on.
     """
 
     T_world_i: Float[Array, "v D D"]
     held: Bool[Array, " v"]
     node: Int[Array, " v"]
-    averaged: AveragedPairs
 
     @classmethod
     def of(cls, previous: ReconstructionSolution, scans: PreparedScans) -> "Held":
@@ -55,8 +53,7 @@ class Held(eqx.Module):
         others = np.cumsum(~held & np.asarray(scans.present))
         node = np.where(np.asarray(scans.present), others, np.max(others) + 1)
         node = np.where(held, 0, node).astype(np.int32)
-        told = jnp.asarray(T), jnp.asarray(held), jnp.asarray(node)
-        return cls(*told, previous.averaged)
+        return cls(jnp.asarray(T), jnp.asarray(held), jnp.asarray(node))
 
     def of_new(self, pairs: Int[Array, "p 2"]) -> Int[Array, "q 2"]:
         """Those of them that have to be measured: not those of scans that stay."""
@@ -114,9 +111,7 @@ class Held(eqx.Module):
         least: Scalar,
         pairs: Int[Array, "p 2"],
     ) -> tuple[Placement, AveragedPairs]:
-        """The others by pairs measured anew, beside those that stay.
-
-        Also what these count for, beside the pairs that those which stay rest on.
+        """The others by pairs measured anew, beside those that stay; and these pairs.
 
         Args:
             scans: prepared scans.
@@ -132,8 +127,7 @@ class Held(eqx.Module):
             of_nodes = _contracted(self, placed, motions)
             nodes = place(of_nodes, self._num_nodes, averaging, least, count)
             placed = _expanded(self, scans.present, placed, nodes)
-        new = AveragedPairs.of(motions, nodes, least)
-        return placed, self.averaged.beside(new)
+        return placed, AveragedPairs.of(motions, nodes, least)
 
     @property
     def _num_nodes(self) -> int:

@@ -11,6 +11,7 @@ import contextlib
 from concurrent.futures import Executor
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -258,6 +259,9 @@ def _of_chosen_pairs(
         known = known.padded(prepared.num_scans)
     told = hold, known, rounds.overlaps
     solution = finish(method, averaging, prepared, motions_padded, *told)
+    if hold is not None and isinstance(previous, ReconstructionSolution):
+        both = previous.averaged.beside(solution.averaged)
+        solution = eqx.tree_at(lambda s: s.averaged, solution, both)
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
     return solution.of_pairs(len(motions.overlap)).of_scans(prepared.num_present)

@@ -11,7 +11,7 @@ from jaxreg._core.status import Status
 from jaxreg.app.result import Result
 
 
-MAX_COVARIANCES = 300  # poses; more ellipsoids than these show nothing
+MAX_COVARIANCES = 300  # poses; of all poses of a graph the matrix is dense
 
 
 def result_of(
