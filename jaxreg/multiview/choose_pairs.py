@@ -37,7 +37,8 @@ _IN_ORDER, _AT_RANDOM = 2, 3
 # pairs were all found, of 60 of a room two in three.
 _NEXT, _ALIKE = 1, 24
 # Tries of a part that is not joined, a scan and round, and draws for them: a part is at
-# most half of all, and few of its pairs with others were tried.
+# most half of all, and few of its pairs with others were tried. As many are looked at
+# where it is known which look alike.
 _TRIES, _DRAWS = 3, 64
 #: A scan is safe by so many trusted pairs; a loop has so many pairs or more.
 SAFE, _LOOP = 3, 4
@@ -133,8 +134,8 @@ def next_pairs(
 
 
 def pair_keys(pairs: np.ndarray, num_scans: int) -> np.ndarray:
-    """`(e,)` int64, one number for each pair i < j."""
-    return pairs[:, 0].astype(np.int64) * num_scans + pairs[:, 1]
+    """`(e,)` int64, one number for each pair i < j; of any leading shape."""
+    return pairs[..., 0].astype(np.int64) * num_scans + pairs[..., 1]
 
 
 def ascending(pairs: np.ndarray) -> np.ndarray:
@@ -151,17 +152,20 @@ def _joining(
 ) -> np.ndarray:
     """From each scan outside of the largest part some pairs with other parts.
 
-    The most alike of those that are drawn, where that is known.
+    The most alike that were not tried, where that is known; else drawn.
     """
-    num, chosen = len(part), []
-    for i in np.flatnonzero(part != np.bincount(part).argmax()):
-        others = np.unique(rng.integers(num, size=_DRAWS))
-        others = rng.permutation(others[part[others] != part[i]])
-        if words is not None:
-            others = others[np.argsort(-words[others] @ words[i], kind="stable")]
-        pairs = np.stack([np.minimum(i, others), np.maximum(i, others)], axis=1)
-        chosen.append(pairs[~np.isin(pair_keys(pairs, num), done)][:_TRIES])
-    return np.concatenate([np.zeros((0, 2), int), *chosen])
+    num = len(part)
+    rows = np.flatnonzero(part != np.bincount(part).argmax())
+    if not len(rows):
+        return np.zeros((0, 2), int)
+    if words is None:
+        others = np.array([rng.permutation(num)[:_DRAWS] for _ in rows])
+    else:
+        others = most_alike(words, min(_DRAWS, num), part, rows)
+    one = np.broadcast_to(rows[:, None], others.shape)
+    both = np.stack([np.minimum(one, others), np.maximum(one, others)], axis=-1)
+    new = ~np.isin(pair_keys(both, num), done) & (part[one] != part[others])
+    return both[new & (np.cumsum(new, axis=1) <= _TRIES)]
 
 
 def _hops(trusted: np.ndarray, pairs: np.ndarray, num: int) -> np.ndarray:

@@ -93,4 +93,4 @@ class GivenScans(NamedTuple):
             positions,
             to_search=to_search,
         )
-        return scans, words_of(scans)
+        return scans, words_of(method, scans)

@@ -49,6 +49,11 @@ def index_of(method: AbstractRegistrar, cloud: PointCloud) -> AbstractIndex:
     return VoxelTable.build(cloud.points, cloud.mask)
 
 
+def describes(method: AbstractRegistrar, d: int) -> bool:
+    """Whether the search of pairs in so many dimensions asks for local features."""
+    return isinstance(method, AbstractSearch) and method.proposes(d)
+
+
 def with_features(
     method: AbstractRegistrar, cloud: PointCloud, spacing: Scalar
 ) -> PointCloud:
@@ -59,8 +64,7 @@ def with_features(
         cloud: a prepared scan.
         spacing: between samples of the coarser scans.
     """
-    d = cloud.points.shape[1]
-    if not (isinstance(method, AbstractSearch) and method.proposes(d)):
+    if not describes(method, cloud.points.shape[1]):
         return cloud
     described = lax.stop_gradient(features_of(cloud.as_judged, spacing))
     if cloud.judged is None:

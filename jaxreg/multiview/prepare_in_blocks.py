@@ -42,9 +42,10 @@ def prepare_in_blocks(
     radius = common_radius(on.put(radius))
     scan = on.prepared(method, (points, mask, viewpoints), radius, with_table=held)
     spacing = None
-    if to_search and held:
+    if to_search:
         scan.within[num:] = 0
         spacing = common_spacing(on.put(scan.within))
+    if spacing is not None and held:
         scan = on.described(method, scan, spacing)
     return _gathered(on, scan, radius, spacing, positions)
 
@@ -68,14 +69,14 @@ def prepare_further(
     points, mask = jax.device_put((points, mask), next(iter(scans.mean.devices())))
     num, on = scans.num_present, ScanBlocks.of(points)
     held = scans.tables is not None and holds_tables(num + on.num)
-    spacing = scans.feature_spacing if held else None
+    spacing = scans.feature_spacing
     old = ungathered(scans)
     if not held:
         old = old._replace(cloud=_undescribed(old.cloud), table=None)
     old, viewpoints = _both_seen(old, viewpoints, points)
     new = (points, mask, viewpoints)
     new = on.prepared(method, new, scans.radius, with_table=held)
-    if spacing is not None:
+    if spacing is not None and held:
         new = on.described(method, new, spacing)
     every = on._replace(num=num + on.num)
 

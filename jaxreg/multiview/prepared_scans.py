@@ -30,8 +30,8 @@ class PreparedScans(eqx.Module):
         mean: `(v, d)` centroid of each scan in its input frame.
         radius: the median root mean square radius of the scans, in the input's unit.
         spacing: `(v,)` distance between thinned points, in units of `radius`.
-        feature_spacing: of the samples that local features are made for, if the method
-            asks for some; None where none are held.
+        feature_spacing: of the samples that local features are made for, held or not;
+            None where no pairs are searched for.
         fault: `(v,)` int32, what is wrong with a scan: TOO_FEW_POINTS, fewer than d + 1
             valid ones; UNIT_DIFFERS, its radius is not of the others' order; CONVERGED,
             nothing.

@@ -71,8 +71,8 @@ def reconstruct(
     Each scan is first registered with a few others that look like it, then pairs follow
     that join parts, close loops, or hold scans that hang by a thread: of up to 20 scans
     at most all pairs, of more ten a scan. Methods other than `ParticleFilter` in 3D do
-    not tell which scans look alike, nor are more than 512 compared: there all pairs of
-    up to 20 scans are registered, and of more the first ones are drawn at random.
+    not tell which scans look alike: there all pairs of up to 20 scans are registered,
+    and of more the first ones are drawn at random.
 
     Args:
         scans: a list of `(n_i, d)` point sets, or a padded array `(v, n, d)`. Of a

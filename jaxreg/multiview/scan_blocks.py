@@ -79,7 +79,7 @@ class ScanBlocks(NamedTuple):
         self, method: AbstractRegistrar, scan: PreparedScan, spacing: Scalar
     ) -> PreparedScan:
         """With the features that the search asks for."""
-        clouds = self.each(lambda some: _described(method, some, spacing), scan.cloud)
+        clouds = self.each(lambda some: described(method, some, spacing), scan.cloud)
         return scan._replace(cloud=clouds)
 
     def each(self, run: Callable[[Any], Tree], scans: Any) -> Tree:
@@ -133,8 +133,9 @@ def _prepared(
 
 
 @kept_program
-def _described(
+def described(
     method: AbstractRegistrar, clouds: PointCloud, spacing: Scalar
 ) -> PointCloud:
-    described = partial(with_features, method, spacing=spacing)
-    return map_side_by_side(described, clouds, clouds.points.shape[1])
+    """A block of clouds with the features that the search asks for."""
+    one = partial(with_features, method, spacing=spacing)
+    return map_side_by_side(one, clouds, clouds.points.shape[1])

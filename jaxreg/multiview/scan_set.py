@@ -112,7 +112,7 @@ class ScanSet(eqx.Module):
         ready = prepare_further(
             self.method, self.scans, *cast_floats(inputs, self.dtype)
         )
-        words = None if self.words is None else words_of(ready, self.words)
+        words = words_of(self.method, ready, self.words)
         origin = _origins(self, given)
         return dataclasses.replace(self, scans=ready, origin=origin, words=words)
 

@@ -11,15 +11,27 @@ Three things everyone should know to improve object retrieval, CVPR 2012 (square
 of counts).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import numpy as np
+from jaxtyping import PyTree
 
+from jaxreg.cloud import Described, PointCloud
+from jaxreg.multiview.method import describes
 from jaxreg.multiview.prepared_scans import PreparedScans
+from jaxreg.multiview.scan_blocks import ScanBlocks, described
+from jaxreg.registrar import AbstractRegistrar
 
 
 # More told a little more, fewer a little less: 128, 256 and 512 were tried.
 _WORDS = 512
+# Scans, drawn at random, whose features the words are drawn from. Those of all told no
+# more, of 600 views of a room and of 900 scans of 30 streets.
+_ASKED = 64
+# Scans that are compared with all others at once.
+_BLOCK = 512
 
 
 class Words(NamedTuple):
@@ -34,47 +46,100 @@ class Words(NamedTuple):
     used: np.ndarray
 
 
-def words_of(scans: PreparedScans, before: Words | None = None) -> Words | None:
-    """What each scan says; None if no scan has local features.
+def words_of(
+    method: AbstractRegistrar, scans: PreparedScans, before: Words | None = None
+) -> Words | None:
+    """What each scan says; None if no scan that is asked has local features.
+
+    Where no features are held, as of very many scans, they are made here and let go.
 
     Args:
+        method: of registration.
         scans: prepared scans.
         before: of the first of them, whose words are the words of all.
     """
-    described = scans.clouds.as_judged.described
-    if described is None:
+    if scans.feature_spacing is None or not describes(method, scans.mean.shape[1]):
         return None
-    first = 0 if before is None else len(before.used)
-    num = scans.num_present - first
-    scan, row = np.nonzero(np.asarray(described.mask)[first : first + num])
-    features = np.asarray(described.even)[first + scan, row]
-    if before is not None:
-        more = _used(features, scan, num, before.vocabulary)
-        return Words(before.vocabulary, np.concatenate([before.used, more]))
-    if not len(scan):
-        return None
-    drawn = np.random.default_rng(0).permutation(len(scan))[:_WORDS]
-    return Words(features[drawn], _used(features, scan, num, features[drawn]))
+    num = scans.num_present
+    if before is None:
+        vocabulary = _drawn(method, scans)
+        if vocabulary is None:
+            return None
+        before = Words(vocabulary, np.zeros((0, len(vocabulary)), np.float32))
+
+    def used(told: Described) -> np.ndarray:
+        return _used(told, before.vocabulary)
+
+    more = _of_features(method, scans, slice(len(before.used), num), used)
+    return before._replace(used=np.concatenate([before.used, more]))
 
 
-def _used(
-    features: np.ndarray, scan: np.ndarray, num: int, vocabulary: np.ndarray
-) -> np.ndarray:
-    """How often each of so many scans, whose features these are, uses each word."""
-    counts = np.zeros((num, len(vocabulary)))
+def _drawn(method: AbstractRegistrar, scans: PreparedScans) -> np.ndarray | None:
+    """`(w, f)` some features of some scans; None if there is none."""
+    rng = np.random.default_rng(0)
+    asked = np.sort(rng.permutation(scans.num_present)[:_ASKED])
+    told = _of_features(method, scans, asked, lambda x: (x.even, x.mask))
+    features = told[0][told[1]]
+    return features[rng.permutation(len(features))[:_WORDS]] if len(features) else None
+
+
+def _of_features(
+    method: AbstractRegistrar,
+    scans: PreparedScans,
+    rows: np.ndarray | slice,
+    run: Callable[[Described], PyTree],
+) -> PyTree:
+    """What `run` tells of each of these scans by their features, in NumPy."""
+    spacing = scans.feature_spacing
+    assert spacing is not None
+    some = jax.tree.map(lambda x: np.asarray(x)[rows], scans.clouds)
+    num = len(some.mask)
+
+    def of_block(clouds: PointCloud) -> PyTree:
+        if clouds.as_judged.described is None:
+            clouds = described(method, clouds, spacing)
+        told = clouds.as_judged.described
+        assert told is not None
+        return run(told)
+
+    told = ScanBlocks.of(scans.clouds.points)._replace(num=num).each(of_block, some)
+    return jax.tree.map(lambda x: x[:num], told)
+
+
+def _used(told: Described, vocabulary: np.ndarray) -> np.ndarray:
+    """`(b, w)` how often each scan of a block uses each word."""
+    from scipy.cluster.vq import vq  # at use: a start takes a tenth longer by it
+
+    scan, row = np.nonzero(np.asarray(told.mask))
+    counts = np.zeros((len(told.mask), len(vocabulary)), np.float32)
     if len(scan):
-        from scipy.cluster.vq import vq  # at use: a start takes a tenth longer by it
-
-        np.add.at(counts, (scan, vq(features, vocabulary)[0]), 1)
+        word, _ = vq(np.asarray(told.even)[scan, row], vocabulary)
+        np.add.at(counts, (scan, word), 1)
     return np.sqrt(counts / np.maximum(counts.sum(axis=1, keepdims=True), 1))
 
 
-def most_alike(words: np.ndarray, num: int) -> np.ndarray:
-    """`(v, num)` for each scan the others most like it, the most alike first."""
-    from scipy.spatial import KDTree  # likewise
+def most_alike(
+    words: np.ndarray,
+    num: int,
+    part: np.ndarray | None = None,
+    rows: np.ndarray | None = None,
+) -> np.ndarray:
+    """`(r, num)` for each scan the others most like it, the most alike first.
 
-    near = np.asarray(KDTree(words).query(words, num + 1)[1])
-    own = near == np.arange(len(words))[:, None]
-    # Of scans that are equal others may come first, and this one not at all.
-    own[~own.any(axis=1), -1] = True
-    return near[~own].reshape(len(words), num)
+    Args:
+        words: `(v, w)` of all scans.
+        num: of others, at most v.
+        part: `(v,)` those of the same part come last; None if each is its own.
+        rows: `(r,)` whose others are wanted; None for all.
+    """
+    part = np.arange(len(words)) if part is None else part
+    rows = np.arange(len(words)) if rows is None else rows
+    out = np.empty((len(rows), num), int)
+    for start in range(0, len(rows), _BLOCK):
+        ids = rows[start : start + _BLOCK]
+        alike = words[ids] @ words.T
+        alike[part[ids][:, None] == part] = -1
+        near = np.argpartition(-alike, num - 1, axis=1)[:, :num]
+        order = np.lexsort((near, -np.take_along_axis(alike, near, axis=1)))
+        out[start : start + _BLOCK] = np.take_along_axis(near, order, axis=1)
+    return out
