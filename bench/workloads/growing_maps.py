@@ -102,8 +102,8 @@ def _held(
     scans: np.ndarray, T_world_i: np.ndarray, place: np.ndarray
 ) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
     """The last scans join a map of the others."""
-    old = Replayed(scans[:OLD], T_world_i[:OLD], place[:OLD], SHARES["street"])
-    every = Replayed(scans, T_world_i, place, SHARES["street"])
+    old = Replayed.of(scans[:OLD], T_world_i[:OLD], place[:OLD], SHARES["street"])
+    every = Replayed.of(scans, T_world_i, place, SHARES["street"])
     before = ScanSet.of(scans[:OLD])
     previous = _reconstructed(before, old)
     told = {"previous": previous, "hold_previous": True}
@@ -114,7 +114,7 @@ def _few(
     scans: np.ndarray, T_world_i: np.ndarray, place: np.ndarray
 ) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
     """A map of few scans."""
-    replayed = Replayed(scans, T_world_i, place, SHARES["street"])
+    replayed = Replayed.of(scans, T_world_i, place, SHARES["street"])
     return partial(_answer, ScanSet.of(scans), replayed, {})
 
 

@@ -138,27 +138,33 @@ class Replayed(Executor):
     """In place of the search: what it would say of a pair, drawn from the truth.
 
     Args:
-        scans: `(v, n, 3)`.
-        T_world_i: their poses.
+        T_world_i: poses of the centred scans, in radii (`in_radii`).
         place: `(v, k)` whose distances tell the share that two scans have in common.
         share: by the distance.
     """
 
     def __init__(
         self,
-        scans: np.ndarray,
         T_world_i: np.ndarray,
         place: np.ndarray,
         share: Callable[[np.ndarray], np.ndarray],
     ) -> None:
+        self._T, self._place, self._share = T_world_i, place, share
+
+    @classmethod
+    def of(
+        cls,
+        scans: np.ndarray,
+        T_world_i: np.ndarray,
+        place: np.ndarray,
+        share: Callable[[np.ndarray], np.ndarray],
+    ) -> "Replayed":
+        """Of scans `(v, n, 3)` and their poses."""
         points = jnp.asarray(scans)
         mask = jnp.ones(points.shape[:2], bool)
         radius = float(common_radius(jax.vmap(rms_radius)(points, mask)))
-        mean = np.asarray(jax.vmap(centroid)(points, mask), np.float64)
-        self._T = T_world_i.copy()
-        self._T[:, :3, 3] += np.einsum("nab,nb->na", T_world_i[:, :3, :3], mean)
-        self._T[:, :3, 3] /= radius
-        self._place, self._share = place, share
+        mean = np.asarray(jax.vmap(centroid)(points, mask))
+        return cls(in_radii(T_world_i, mean, radius), place, share)
 
     def submit(self, fn: object, /, *args: Any, **kwargs: Any) -> Future:
         """The motions of the pairs of a task."""
@@ -200,13 +206,21 @@ def _solved(
     share: Callable[[np.ndarray], np.ndarray],
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    with Replayed(scans, T_world_i, place, share) as executor:
+    with Replayed.of(scans, T_world_i, place, share) as executor:
         found = reconstruct(scans, key=jax.random.key(seed), executor=executor)
     return (
         np.asarray(found.T_world_i),
         np.asarray(found.placed),
         len(np.asarray(found.overlap)),
     )
+
+
+def in_radii(T_world_i: np.ndarray, mean: np.ndarray, radius: float) -> np.ndarray:
+    """Poses of scans less their means, in a unit of so much."""
+    T = T_world_i.copy()
+    T[:, :3, 3] += np.einsum("nab,nb->na", T[:, :3, :3], mean.astype(np.float64))
+    T[:, :3, 3] /= radius
+    return T
 
 
 def _judged(T_true: np.ndarray, answers: list[Any]) -> Judged:
