@@ -73,6 +73,7 @@ def first_pairs(
     order: Order,
     rng: np.random.Generator,
     words: np.ndarray | None = None,
+    since: int = 0,
 ) -> np.ndarray:
     """The pairs of the first round, `(e, 2)` int32 in ascending order.
 
@@ -82,20 +83,24 @@ def first_pairs(
             far as there are many; "any": those and pairs that look alike, or at random.
         rng: of the caller.
         words: `(v, w)` of scans that look alike (`words_of`), or None.
+        since: the first scan that is new; pairs of two before it are left out.
     """
     few = ALL_UP_TO if words is None else _FEW
     if num_scans <= few and order == "any":
-        return all_pairs(num_scans)
+        every = all_pairs(num_scans)
+        return every[every[:, 1] >= since]
     ids = np.arange(num_scans)
     chosen = [(ids[:-step], ids[step:]) for step in range(1, _IN_ORDER + 1)]
     if order == "any" and words is not None:
-        near = most_alike(words, min(_ALIKE, max(num_scans // 3, 2)))
+        new = ids[since:]
+        near = most_alike(words, min(_ALIKE, max(num_scans // 3, 2)), rows=new)
         one_of = rng.permuted(near[:, 1:], axis=1)[:, 0]
-        chosen = [*chosen[:_NEXT], (ids, near[:, 0]), (ids, one_of)]
+        chosen = [*chosen[:_NEXT], (new, near[:, 0]), (new, one_of)]
     elif order == "any":
         ring = rng.permutation(num_scans)
         chosen += [(ring, np.roll(ring, step)) for step in range(1, _AT_RANDOM + 1)]
-    return ascending(np.concatenate([np.stack(x, axis=1) for x in chosen]))
+    every = ascending(np.concatenate([np.stack(x, axis=1) for x in chosen]))
+    return every[every[:, 1] >= since]
 
 
 def next_pairs(

@@ -313,8 +313,8 @@ def _known(
     first = None
     if earlier is not None:
         rng = np.random.default_rng(num_old)
-        new = first_pairs(scans.num_present, order, rng, words)
-        first = np.concatenate([motions.pairs, new[new[:, 1] >= num_old]])
+        new = first_pairs(scans.num_present, order, rng, words, num_old)
+        first = np.concatenate([motions.pairs, new])
         first = np.unique(first, axis=0)
     return motions.heard(scans), first
 

@@ -102,6 +102,25 @@ def test_the_first_pairs_are_of_scans_that_look_alike():
     assert {tuple(x) for x in best} <= {tuple(x) for x in pairs}
 
 
+def test_scans_that_come_later_are_paired_by_what_they_look_like():
+    words = np.repeat(np.eye(4), 15, axis=0).reshape(4, 15, 4).swapaxes(0, 1)
+    words = words.reshape(60, 4) + 0.01 * RNG.standard_normal((60, 4))
+    words /= np.linalg.norm(words, axis=1, keepdims=True)
+    pairs = first_pairs(60, "any", RNG, words, since=55)
+    assert np.all(pairs[:, 1] >= 55)
+    in_order = pairs[:, 1] - pairs[:, 0] == 1
+    assert np.sum(in_order) == 5
+    others, count = np.unique(pairs[~in_order], return_counts=True)
+    # Each new one by the most alike, and by one more.
+    assert np.all(count[others >= 55] >= 1)
+    assert 5 <= np.sum(~in_order) <= 10
+    same = pairs[~in_order, 0] % 4 == pairs[~in_order, 1] % 4
+    assert np.sum(same) >= 5
+    assert first_pairs(5, "any", RNG, None, since=3).tolist() == [
+        [0, 3], [0, 4], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4],
+    ]  # fmt: skip
+
+
 def test_parts_are_joined_where_scans_look_alike():
     tried = all_pairs(5)
     part, trusted = np.array([0, 0, 0, 0, 0, 5]), np.ones(len(tried), bool)
