@@ -88,6 +88,7 @@ def place(
     averaging: AbstractAverager | None,
     least: Scalar,
     count: Int[Array, ""] | None = None,
+    T_start: Float[Array, "v D D"] | None = None,
 ) -> Placement:
     """Averages the pairs that are likely; the world is the frame of the root.
 
@@ -114,18 +115,19 @@ def place(
         averaging: None for `Correntropy`.
         least: log evidence of the pairs that count.
         count: how many scans there are, None for all.
+        T_start: poses to start from, of parts that hang together by these pairs in a
+            frame of each; None to start from the pairs.
     """
     num_tries = most_tries(num_scans if count is None else count)
     strong = least + jnp.log(num_tries.astype(least.dtype))
     best = jnp.zeros(len(motions.pairs), jnp.int32)
     alike = jnp.full(len(best), _is_symmetric(motions, least))
+    told = num_scans, averaging, (least, strong), T_start
     if motions.num_modes == 1:
-        return _averaged(motions, best, alike, num_scans, averaging, (least, strong))
+        return _averaged(motions, best, alike, *told)
 
     def again(state: _Pass) -> _Pass:
-        found = _averaged(
-            motions, state.mode, state.agrees, num_scans, averaging, (least, strong)
-        )
+        found = _averaged(motions, state.mode, state.agrees, *told)
         mode, agrees = agreeing(motions, found, least)
         differs = jnp.any((mode != state.mode) | (agrees != state.agrees))
         return _Pass(mode, agrees, found, state.number + 1, differs)
@@ -159,6 +161,7 @@ def _averaged(
     num_scans: int,
     averaging: AbstractAverager | None,
     told: tuple[Scalar, Scalar],
+    T_start: Float[Array, "v D D"] | None,
 ) -> Placement:
     """By one mode of each pair, which others rival unless it agrees with poses.
 
@@ -181,6 +184,8 @@ def _averaged(
     if averaging is None:
         averaging = Correntropy()
         start = _likeliest_tree(graph, log_evidence)
+    if T_start is not None:  # each part in the frame that it hangs by
+        start = lie.between(T_start[label], T_start)[swap]
     solution = average(graph, averaging, start)
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
     agreed = jnp.where(joins(edge_weight), trusted, 0)

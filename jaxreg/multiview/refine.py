@@ -63,18 +63,22 @@ def refine(
         The placement by these pairs, the pairs, and what each counted for. Scans that
         no pair holds any more keep their poses, but are alone.
     """
+    # From the poses that there are: a tree of thousands of scans drifts, and where its
+    # ends meet pairs would be given up that agree with the poses.
+    starts = averaging is None
     averaging = wide_unless_given(averaging)
     moving, scans = scans, lax.stop_gradient(scans)
 
-    def averaged(motions: RelativeMotions) -> Placement:
-        return place(motions, scans.num_scans, averaging, least, scans.count)
+    def averaged(motions: RelativeMotions, before: Placement) -> Placement:
+        start = lax.stop_gradient(before.T_world_i) if starts else None
+        return place(motions, scans.num_scans, averaging, least, scans.count, start)
 
     motions = measured(scans, placement, least, pairs, exact=False)
-    placement = _updated(placement, averaged(motions))
+    placement = _updated(placement, averaged(motions, placement))
     motions = measured(scans, placement, least, pairs, exact=True)
     optimiser, width = optimiser_of(motions.T_i_j), widths_of(moving, placement)[-1]
     motions = follow_points(moving, motions, optimiser, width, least)
-    average = averaged(motions)
+    average = averaged(motions, placement)
     counted = AveragedPairs.of(motions, average, least)
     return _updated(placement, average), motions, counted
 
