@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from helpers import motion, pose_error
 
+from jaxreg import MCC, SpanningTree
 from jaxreg.multiview import RelativeMotions
 from jaxreg.multiview.choose_pairs import all_pairs
 from jaxreg.multiview.place import Placement, place
@@ -144,3 +145,27 @@ def test_a_wrong_pair_that_shares_much_does_not_keep_likelier_ones_out():
     np.testing.assert_array_equal(found.part, 0)
     trusted = np.asarray(found.edge_weight)[: len(i)] > 0.5
     np.testing.assert_array_equal(trusted, np.arange(len(i)) < 23)
+
+
+def test_poses_to_start_from_decide_where_a_tree_would_lead_astray():
+    T = np.stack([motion(k, 3) for k in range(NUM)])
+    ids = np.concatenate([all_pairs(6), [[0, 6], [1, 6], [2, 6], [7, 8]]])
+    T_i_j = np.linalg.inv(T[ids[:, 0]]) @ T[ids[:, 1]]
+    overlap, wrong = np.full(len(ids), 0.4), len(ids) - 4
+    T_i_j[wrong], overlap[wrong] = motion(50, 3), 0.9  # which a tree takes first
+    row = overlap[:, None].astype(np.float32)
+    each = ids.astype(np.int32), T_i_j[:, None].astype(np.float32), row, 12 * row, row
+    motions = RelativeMotions(*map(jnp.asarray, each))
+    start = T.copy()
+    start[7:9, :3, 3] += 1e3  # a part in a frame of its own
+    method, start = MCC(initialiser=SpanningTree()), jnp.asarray(start, jnp.float32)
+    found = place(motions, NUM, method, LEAST, None, start)
+    np.testing.assert_array_equal(found.part, [0] * 7 + [7, 7, 9])
+    trusted = np.asarray(found.edge_weight) > 0.1
+    np.testing.assert_array_equal(trusted, np.arange(len(ids)) != wrong)
+    T_found = np.asarray(found.T_world_i)
+    for i, j in ids.tolist():
+        T_true = np.linalg.inv(T[i]) @ T[j]
+        angle, shift = pose_error(np.linalg.inv(T_found[i]) @ T_found[j], T_true)
+        assert angle < 1e-3
+        assert shift < 1e-3
