@@ -1,5 +1,6 @@
 """Whole scans in the common frame: each file written again, with all that it holds."""
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -23,11 +24,33 @@ from jaxreg.io.points.read import (
 
 
 class ScanFile(NamedTuple):
-    """Where a scan is: its unique name, the file, and the key within an archive."""
+    """Where a scan is.
+
+    Attributes:
+        name: a unique one.
+        file: that it is in.
+        key: within an archive, or None.
+        state: of the file as it was read (`state_of`); None if that does not matter.
+    """
 
     name: str
     file: Path
     key: str | None
+    state: tuple[int, int] | None = None
+
+    @property
+    def is_as_read(self) -> bool:
+        """Whether the file has not changed since."""
+        return self.state is None or self.state == state_of(self.file)
+
+
+def state_of(file: Path) -> tuple[int, int]:
+    """The size in bytes and the time of the last change of a file, in ns."""
+    try:
+        found = os.stat(file)
+    except OSError:
+        return -1, -1  # gone
+    return found.st_size, found.st_mtime_ns
 
 
 def list_scans(paths: Sequence[Path]) -> list[ScanFile]:
@@ -56,15 +79,21 @@ def _scans_of(path: Path) -> Iterator[ScanFile]:
         yield ScanFile(stem(file) if alone else one, file, one)
 
 
-def scan_file(path: Path, name: str) -> ScanFile:
-    """Of a scan that `read_named` calls so, of a path with or without a key."""
+def scan_file(path: Path, name: str, state: tuple[int, int]) -> ScanFile:
+    """Of a scan that `read_named` calls so, of a path with or without a key.
+
+    Args:
+        path: the file, with or without a key.
+        name: of the scan.
+        state: of the file before it was read.
+    """
     file, key = split_key(path)
     if suffix_of(file) not in ARCHIVES:
-        return ScanFile(name, file, None)
+        return ScanFile(name, file, None, state)
     if key is None:
         keys = keys_of(file)
         key = name if name in keys else keys[0]
-    return ScanFile(name, file, key)
+    return ScanFile(name, file, key, state)
 
 
 def keys_of(path: Path) -> list[str]:
@@ -95,7 +124,7 @@ def write_aligned(
     written: list[str] = []
     archives: dict[Path, dict[str, np.ndarray]] = {}
     for k, T in motions.items():
-        name, file, key = scans[k]
+        name, file, key, _ = scans[k]
         if key is not None:
             archives.setdefault(file, {})[key] = T
             continue

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from jaxreg.app.aligned import ScanFile, scan_file
+from jaxreg.app.aligned import ScanFile, scan_file, state_of
 from jaxreg.app.cli.options import ModelOptions
 from jaxreg.app.merge import Look
 from jaxreg.cloud import OTHER_UNIT
@@ -17,6 +17,7 @@ from jaxreg.io.points.read import (
     notes_on_skipped,
     point_files,
     read_named,
+    split_key,
     unique_names,
 )
 from jaxreg.io.rows import numbers, read_lines
@@ -95,14 +96,15 @@ def load_scans(
     for path, unit in zip(paths, units or [1.0] * len(paths), strict=True):
         notes += notes_on_skipped(path)
         found = [
-            (file, *item)
+            (file, state, *item)
             for file in point_files(path)
+            for state in [state_of(split_key(file)[0])]
             for item in read_named(file, _MAX_POINTS).items()
         ]
         alone = len(found) == 1 and not path.is_dir()
-        for file, name, scan in found:
+        for file, state, name, scan in found:
             names.append(name)
-            files.append(scan_file(file, name))
+            files.append(scan_file(file, name, state))
             fields.append(scan.fields)
             steps.append(scan.step)
             points.append(scan.points if unit == 1 else unit * scan.points)
@@ -128,7 +130,7 @@ def load_scans(
 def look_of(scans: Scans, options: ModelOptions) -> Look:
     """Colours and normals of the points that were read, as the options want them."""
     found = [
-        read_attributes(file.file, fields, step, file.key)
+        read_attributes(file.file, fields if file.is_as_read else (), step, file.key)
         for file, fields, step in zip(
             scans.files, scans.fields, scans.steps, strict=True
         )

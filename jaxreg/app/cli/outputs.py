@@ -100,7 +100,7 @@ def write_files(
         if isinstance(session.options, ModelOptions) and read is not None:
             with session.timed("write"):
                 look = look_of(read, session.options) if result.believed else None
-                result = _with_aligned(session.options, staging, result, read)
+                result = _with_aligned(session, staging, result, read)
         document = result_document(
             result,
             command=session.command,
@@ -128,14 +128,23 @@ def write_files(
 
 
 def _with_aligned(
-    options: ModelOptions, staging: Path, result: Result, read: Scans
+    session: Session, staging: Path, result: Result, read: Scans
 ) -> Result:
-    """The result, its scans written whole: folders aligned, aligned_1, ..."""
+    """The result, its scans written whole: folders aligned, aligned_1, ...
+
+    A file that has changed since it was read is left out, and named: what is in it now
+    may lie elsewhere.
+    """
+    options = session.options
+    assert isinstance(options, ModelOptions)
     if not (options.save_aligned and result.believed):
         return result
+    same = np.array([scan.is_as_read for scan in read.files])
+    for name in (scan.name for scan in read.files if not scan.is_as_read):
+        session.console.print(f"{name}: has changed since it was read, not aligned.")
     names: list[str] = []
     for k in range(result.num_components):
-        ids = np.flatnonzero(result.component == k)
+        ids = np.flatnonzero((result.component == k) & same)
         folder = staging / (f"aligned_{k}" if k else "aligned")
         folder.mkdir()
         motions = {int(i): result.T_file[i] for i in ids}

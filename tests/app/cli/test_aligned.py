@@ -3,11 +3,13 @@
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plyfile
 import pytest
 
+import jaxreg
 from jaxreg.app.cli.main import main
 from jaxreg.io import read_points, write_kitti, write_points, write_tum
 from tests.app.cli.stand_ins import CLOUD, POSES, fake_reconstruct, seen_from
@@ -51,6 +53,36 @@ def test_scans_are_saved_whole_in_the_common_frame(
     # Another run without the option leaves none of an older result.
     assert main(["multiview", *scans]) == 0
     assert os.listdir("jaxreg-out/aligned") == []
+
+
+@pytest.mark.parametrize("how", ["rewritten", "removed"])
+def test_a_scan_that_changes_meanwhile_is_left_out_and_named(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    how: str,
+):
+    scans = _save(folder)
+    fake_reconstruct(monkeypatch, POSES, [True] * 3)
+    solve = jaxreg.reconstruct
+
+    def meanwhile(*args: Any, **told: Any) -> Any:
+        Path(scans[1]).unlink()
+        if how == "rewritten":
+            write_points(scans[1], 2 * CLOUD[:30])
+        return solve(*args, **told)
+
+    monkeypatch.setattr(jaxreg, "reconstruct", meanwhile)
+    assert main(["multiview", *scans, "--save-aligned", "--color", "own"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "s1: has changed since it was read, not aligned" in said
+    assert sorted(os.listdir("jaxreg-out/aligned")) == ["s0.ply", "s2.ply"]
+    files = json.loads(Path("jaxreg-out/result.json").read_text())["files"]
+    assert "aligned/s1.ply" not in files
+    # What was read is in the model, without colours of its own.
+    vertex = plyfile.PlyData.read("jaxreg-out/merged.ply")["vertex"]
+    assert len(vertex["red"]) == 120
+    np.testing.assert_array_equal(vertex["red"][:40], COLORS[:, 0])
 
 
 def test_scans_are_not_replaced_by_what_is_made_of_them(
