@@ -67,6 +67,8 @@ class Case:
         judge: accuracy of the answers, one for each trial.
         repeats: timed calls of each method on each trial; five calls at the least.
         long: whether a call takes up to minutes: three are enough.
+        once: whether it takes many: one after the first is enough, whose memory is
+            looked at.
         reference: the method that others are compared with in time.
         items: things that a call handles, named `item`, for a rate; 0 for none.
         warm_up: whether trials differ in shape, so that each compiles.
@@ -83,10 +85,11 @@ class Case:
     item: str = ""
     warm_up: bool = False
     long: bool = False
+    once: bool = False
     x: float | None = None
     x_label: str = ""
 
     def __post_init__(self) -> None:
-        least = 3 if self.long else 5
+        least = 1 if self.once else 3 if self.long else 5
         if self.repeats * len(self.trials) < least:
             raise ValueError(f"{self.name}: fewer than {least} calls of each method")

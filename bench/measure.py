@@ -47,7 +47,11 @@ def measure(
         if seconds is not None:
             prepared[method.name] = seconds
     first, calls, failed = timing.in_turn(
-        solves, case.trials, case.repeats, warm_up=case.warm_up, before=before
+        solves,
+        case.trials,
+        0 if case.once else case.repeats,
+        warm_up=case.warm_up,
+        before=before,
     )
     for method in methods:
         name = method.name
@@ -55,13 +59,16 @@ def measure(
             rows[name] = replace(rows[name], status="failed", why=failed[name])
         if name not in calls:
             continue
-        metrics = _times(case, method, first[name], calls[name])
+        metrics = []
         if name in prepared:
             metrics.append(Metric("prepare_ms", 1e3 * prepared[name], "ms", "down"))
         if not method.in_processes:
             before(name)
-            memory = growth_mib(lambda name=name: solves[name](*case.trials[0]))
+            last, memory = _looked_at(solves[name], case.trials[0])
             metrics.append(Metric("memory_mib", memory, "MiB", "down"))
+            if case.once:
+                calls[name][0].append(last)
+        metrics = [*_times(case, method, first[name], calls[name]), *metrics]
         judged = case.judge([of_trial[-1].value for of_trial in calls[name]])
         rows[name] = replace(
             rows[name],
@@ -92,6 +99,13 @@ def _prepared(method: Method) -> tuple[Solve, float | None]:
     method.prepare()
     took = timing.timed(method.prepare)
     return took.value, took.cpu
+
+
+def _looked_at(solve: Solve, trial: tuple) -> tuple[timing.Timed, float]:
+    """A call, and the MiB it needs; nothing looks on while it runs."""
+    calls: list[timing.Timed] = []
+    memory = growth_mib(lambda: calls.append(timing.timed(lambda: solve(*trial))))
+    return calls[0], memory
 
 
 def _times(

@@ -24,7 +24,8 @@ SIZES = {
     0.1: (1_000, 3_000, 10_000, 100_000, 1_000_000),
 }
 CHAINS = (100_000, 1_000_000)
-#: Poses from which on a graph is float32: of a million it takes twice the memory else.
+#: Poses from which on a graph is float32, as of a million it takes twice the memory
+#: else, and is solved once.
 _SINGLE = 1_000_000
 #: Wrong closures fill the factors of GTSAM's elimination: a call of LM takes 3 s at
 #: 1,000 poses, 68 s and 1 GB at 3,000; one of GNC 40 s at 1,000.
@@ -55,6 +56,7 @@ def _chain_case(num: int) -> Case:
         judge=partial(judge, X, wrong),
         repeats=3,
         long=True,
+        once=num >= _SINGLE,
         x=num,
         x_label="poses of a chain, 1% closures, a tenth of them wrong",
     )
@@ -106,6 +108,7 @@ def _case(num: int, outliers: float, *, quick: bool) -> Case:
         repeats=3 if long else 5,
         reference="GTSAM LM" if peer else "",
         long=long,
+        once=num >= _SINGLE,
         x=num,
         x_label=f"poses, {outliers:.0%} of the edges wrong",
     )

@@ -29,6 +29,8 @@ from jaxreg.multiview.prepare import common_radius
 
 
 SIZES = (100, 1_000, 10_000)
+#: Scans of which a call takes many minutes.
+_MANY = 10_000
 #: Points of a scan, and how far its scanner sees: along a street in steps, of an object
 #: of radius 1 in radians.
 _POINTS, _REACH, _SIGHT = 400, 6.0, 0.9
@@ -55,9 +57,10 @@ def cases(options: Options) -> Iterator[Case]:
                 name=f"{scene}, {num} scans",
                 data=f"generated {scene}, scans of {_POINTS} points",
                 methods=[own],
-                trials=[(seed,) for seed in range(3)],
+                trials=[(seed,) for seed in range(1 if num >= _MANY else 3)],
                 judge=partial(_judged, T_world_i),
                 long=True,
+                once=num >= _MANY,
                 x=float(num),
                 x_label=f"scans of a {scene}",
             )

@@ -55,6 +55,15 @@ def test_a_row_has_accuracy_and_costs():
     assert low <= a.metrics["wall_ms"].value <= high
 
 
+def test_what_takes_many_minutes_is_called_once_after_the_first():
+    called = []
+    method = _method("slow", lambda: called.append(0) or 3.0)
+    case = Case("case", "made", [method], [()], lambda found: Judged([]), once=True)
+    (row,) = measure(case, [method], BLANK)
+    assert (row.calls, len(called)) == (1, 2)
+    assert all(row.value(k) is not None for k in ("cpu_ms", "first_s", "memory_mib"))
+
+
 def test_an_absent_peer_is_a_row_and_not_called(absent: str):
     def never(_: float) -> float:
         raise AssertionError
