@@ -17,9 +17,8 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
+from jaxreg.graph.hops import hops
 from jaxreg.multiview.similar_scans import most_alike
 
 
@@ -42,9 +41,8 @@ _NEXT, _ALIKE = 1, 24
 _TRIES, _DRAWS = 3, 64
 #: A scan is safe by so many trusted pairs; a loop has so many pairs or more.
 SAFE, _LOOP = 3, 4
-# Longer loops are as good as one of so many pairs; hops are counted from so many scans
-# at a time.
-_LONG, _FROM = 32, 256
+# Longer loops are as good as one of so many pairs.
+_LONG = 32
 #: Scans are taken to overlap by the poses from this share on; loops are closed by such
 #: that share more: a search of less finds one pair in seven.
 LIKELY, _CLOSING = 0.2, 0.3
@@ -130,10 +128,10 @@ def next_pairs(
     open_ &= part[near[:, 0]] == np.bincount(part).argmax()
     both = np.concatenate([near[open_], near[open_][:, ::-1]])
     worth = np.tile(overlap[open_], 2)
-    hops = _hops(tried[trusted], both, num)
+    between = hops(tried[trusted], both, num, _LONG)
     few = np.bincount(tried[trusted].ravel(), minlength=num) < SAFE
-    far = (hops >= _LOOP) & (worth >= _CLOSING)
-    for value in (worth * hops * far, worth * few[both[:, 0]]):
+    far = (between >= _LOOP) & (worth >= _CLOSING)
+    for value in (worth * between * far, worth * few[both[:, 0]]):
         chosen.append(_best_of_each(both, value))
     return ascending(np.concatenate(chosen))
 
@@ -145,8 +143,12 @@ def pair_keys(pairs: np.ndarray, num_scans: int) -> np.ndarray:
 
 def ascending(pairs: np.ndarray) -> np.ndarray:
     """Each pair once, as i < j, sorted; `(e, 2)` int32."""
-    pairs = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
-    return np.unique(pairs, axis=0).astype(np.int32)
+    low, high = np.minimum(*pairs.T).astype(np.int64), np.maximum(*pairs.T)
+    num = int(high.max(initial=0)) + 1
+    # `np.unique` hashes, which takes ten times as long.
+    keys = np.sort((low * num + high)[low != high])
+    keys = keys[np.diff(keys, prepend=-1) > 0]
+    return np.stack(np.divmod(keys, num), axis=1).astype(np.int32)
 
 
 def _joining(
@@ -171,20 +173,6 @@ def _joining(
     both = np.stack([np.minimum(one, others), np.maximum(one, others)], axis=-1)
     new = ~np.isin(pair_keys(both, num), done) & (part[one] != part[others])
     return both[new & (np.cumsum(new, axis=1) <= _TRIES)]
-
-
-def _hops(trusted: np.ndarray, pairs: np.ndarray, num: int) -> np.ndarray:
-    """Trusted pairs on the way between two scans, of many `_LONG`."""
-    i, j = trusted.T
-    ways = coo_array((np.ones(len(i)), (i, j)), (num, num)).tocsr()
-    out = np.zeros(len(pairs))
-    scans, row = np.unique(pairs[:, 0], return_inverse=True)
-    for start in range(0, len(scans), _FROM):
-        some = scans[start : start + _FROM]
-        hops = dijkstra(ways, False, some, unweighted=True, limit=_LONG)
-        these = (row >= start) & (row < start + len(some))
-        out[these] = hops[row[these] - start, pairs[these, 1]]
-    return np.minimum(out, _LONG)
 
 
 def _best_of_each(pairs: np.ndarray, value: np.ndarray) -> np.ndarray:

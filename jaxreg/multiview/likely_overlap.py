@@ -189,7 +189,12 @@ def _sharing_cells(
     # Cells of one number that are not the same cost a look, and do no harm.
     key = cells.astype(np.int64) @ _PRIMES[: cells.shape[-1]]
     key = key + part.astype(np.int64)[:, None] * _PRIME
-    key, scan = (key % _MOST).ravel(), np.repeat(np.arange(num), m)
+    key, scan = key % _MOST, np.repeat(np.arange(num), m)
+    theirs, key = np.unique(key[scans]), key.ravel()
+    if len(scans) < num:
+        place = np.minimum(np.searchsorted(theirs, key), len(theirs) - 1)
+        of_theirs = theirs[place] == key
+        key, scan = key[of_theirs], scan[of_theirs]
     key, scan = np.divmod(np.unique(key * num + scan), num)
     first = np.flatnonzero(np.diff(key, prepend=-1))
     cell, first = (
