@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Int
 from jaxreg._core.arrays import full_matmul
 from jaxreg.geometry import lie
 from jaxreg.linear.small import product
-from jaxreg.local.covariance import after_steps, answer
+from jaxreg.local.answer import answer
+from jaxreg.local.held_directions import after_steps
 from jaxreg.matching.problem import match
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import NUM_STEPS, WIDTH_END, optimiser_of

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxreg.local.covariance import after_steps
+from jaxreg.local.held_directions import after_steps
 
 
 @pytest.mark.parametrize("num", [1, 8])

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 import jaxreg as jr
 from jaxreg.linear import laplacian
-from jaxreg.local.covariance import answer
+from jaxreg.local.answer import answer
 from jaxreg.local.steps import turn_and_shift
 from jaxreg.matching.problem import match
 from jaxreg.multiview import follow_motions, surface_errors
