@@ -56,3 +56,15 @@ def test_all_around_the_viewpoint():
     depth = np.asarray(jax.jit(lambda i, x: i.depth_before(x))(image, inside))
     assert np.mean(np.isfinite(depth)) > 0.9
     np.testing.assert_allclose(depth[np.isfinite(depth)], 0.4, atol=1e-3)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_padding_changes_nothing(d):
+    wall = _wall(d)[:: 10 if d == 2 else 1]
+    probes = jnp.array([[1.0, 0.1, 0.2], [1.9, 0.3, -0.2], [3, 0.2, 0.4]])[:, :d].T
+    padded = jnp.asarray(np.pad(wall, ((0, 2 * len(wall)), (0, 0))), jnp.float32)
+    mask = jnp.arange(len(padded)) < len(wall)
+    image = RangeImage.of(padded, mask, jnp.zeros(d, jnp.float32))
+    alone = _image(wall, np.zeros(d)).depth_before(probes)
+    assert np.all(np.isfinite(alone))
+    np.testing.assert_allclose(image.depth_before(probes), alone, atol=1e-5)

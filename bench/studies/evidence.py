@@ -24,7 +24,7 @@ from scipy.special import expit, logsumexp
 from bench.studies.evidence_modes import NUMBERS, modes_of
 from bench.studies.evidence_pairs import CHECKED, GENERATED, KINDS
 from bench.studies.reliability import Reliability, draw
-from jaxreg.matching import evidence
+from jaxreg.matching import odds
 
 
 # Keys of a pair.
@@ -38,8 +38,8 @@ _PLOT = Path(__file__).parents[1] / "plots" / "evidence_reliability.png"
 class Examples(NamedTuple):
     """Best right and best wrong modes of pairs.
 
-    `numbers` `(n, 3)` are log gain, near and firm, `right` `(n,)` 1 or 0, `pair`
-    `(n,)` the place of the pair in its kind.
+    `numbers` `(n, k)` are log gain, near and firm (in 2D others), `right` `(n,)` 1 or
+    0, `pair` `(n,)` the place of the pair in its kind, or its scene.
     """
 
     numbers: np.ndarray
@@ -71,7 +71,7 @@ def main() -> None:
         return
     rows = {kind: list(_read(args.out / f"{kind}.jsonl")) for kind in args.only}
     rows = {kind: found for kind, found in rows.items() if found}
-    examples = {kind: _examples(found) for kind, found in rows.items()}
+    examples = {kind: examples_of(found) for kind, found in rows.items()}
     for line in (*discriminants(examples), *choices(rows), *reliability(rows)):
         print(line)
 
@@ -83,7 +83,7 @@ def discriminants(examples: dict[str, Examples]) -> Iterator[str]:
     check = [x.of_half(1) for k, x in told.items() if k not in GENERATED]
     unseen = [x for k, x in examples.items() if k in CHECKED]
     every, found = list(told.values()), fitted(choose)
-    code = evidence._GAIN, evidence._NEAR, evidence._FIRM, -evidence._OFFSET
+    code = odds._GAIN, odds._NEAR, odds._FIRM, -odds._OFFSET
     yield "| | log gain | near | firm | offset | examples | loss | AUC |"
     yield "|---|---|---|---|---|---|---|---|"
     for name, numbers, kinds in (
@@ -98,14 +98,14 @@ def discriminants(examples: dict[str, Examples]) -> Iterator[str]:
         if kinds:
             four = " | ".join(f"{x:.1f}" for x in numbers)
             count = sum(len(x.right) for x in kinds)
-            yield f"| {name} | {four} | {count} | {_quality(numbers, kinds)} |"
+            yield f"| {name} | {four} | {count} | {quality(numbers, kinds)} |"
     yield "\n| found without | right, wrong | loss | AUC | right above the best wrong |"
     yield "|---|---|---|---|---|"
     for kind, own in examples.items():
         numbers = fitted([x for k, x in told.items() if k != kind])
         sizes = f"{own.right.sum():.0f}, {(1 - own.right).sum():.0f}"
         above = _above(_scores(numbers, own), own.right)
-        yield f"| {kind} | {sizes} | {_quality(numbers, [own])} | {above} |"
+        yield f"| {kind} | {sizes} | {quality(numbers, [own])} | {above} |"
 
 
 def fitted(kinds: list[Examples]) -> np.ndarray:
@@ -135,7 +135,7 @@ def choices(rows: dict[str, list[dict[str, Any]]]) -> Iterator[str]:
     yield "|---|---|---|---|---|"
     total = np.zeros(5, int)
     for kind, found in rows.items():
-        right = [[_is_right(mode) for mode in row["modes"]] for row in found]
+        right = [[is_right(mode) for mode in row["modes"]] for row in found]
         first = np.array([x[0] for x in right])
         sure = np.array([row["status"] == "CONVERGED" for row in found])
         counts = [len(found), sum(map(any, right)), first.sum(), sure.sum()]
@@ -148,7 +148,7 @@ def choices(rows: dict[str, list[dict[str, Any]]]) -> Iterator[str]:
 def reliability(rows: dict[str, list[dict[str, Any]]]) -> Iterator[str]:
     """Of the answers: of the evidence alone, and with that of the other modes."""
     told = [row for found in rows.values() for row in found]
-    right = np.array([_is_right(row["modes"][0]) for row in told], float)
+    right = np.array([is_right(row["modes"][0]) for row in told], float)
     scores = [np.array([m["log_evidence"] for m in row["modes"]]) for row in told]
     # One of the modes is right, or none of them.
     shared = np.array([np.exp(x[0] - logsumexp(np.append(x, 0))) for x in scores])
@@ -182,24 +182,27 @@ def _read(path: Path) -> Iterator[dict[str, Any]]:
                 yield row
 
 
-def _examples(rows: list[dict[str, Any]]) -> Examples:
+def examples_of(
+    rows: list[dict[str, Any]], names: tuple[str, ...] = NUMBERS
+) -> Examples:
     """The best right and the best wrong mode of each pair, of its first key.
 
     An answer that slides is neither: its surfaces coincide wherever it slides to.
     """
     numbers, right, pair = [], [], []
-    first = [row for row in rows if row["key"] == 0]
+    first = [row for row in rows if row.get("key", 0) == 0]
     for at, row in enumerate(first):
         ordered = row["modes"][1:] if _slides(row) else row["modes"]
         for wanted, some in (
-            (1.0, [m for m in ordered if _is_right(m)]),
-            (0.0, [m for m in ordered if _is_wrong(m)]),
+            (1.0, [m for m in ordered if is_right(m)]),
+            (0.0, [m for m in ordered if is_wrong(m)]),
         ):
             for mode in some[:1]:
-                numbers.append([mode[name] for name in NUMBERS])
+                numbers.append([mode[name] for name in names])
                 right.append(wanted)
-                pair.append(at)
-    return Examples(np.array(numbers), np.array(right), np.array(pair))
+                pair.append(row.get("scene", at))
+    numbers = np.reshape(numbers, (len(right), len(names)))
+    return Examples(numbers, np.array(right), np.array(pair))
 
 
 def _slides(row: dict[str, Any]) -> bool:
@@ -207,11 +210,13 @@ def _slides(row: dict[str, Any]) -> bool:
     return not row["modes"][0]["holds"]
 
 
-def _is_right(mode: dict[str, float]) -> bool:
+def is_right(mode: dict[str, float]) -> bool:
+    """Within 5 degrees and a tolerance."""
     return mode["degrees"] < _RIGHT[0] and mode["tolerances"] < _RIGHT[1]
 
 
-def _is_wrong(mode: dict[str, float]) -> bool:
+def is_wrong(mode: dict[str, float]) -> bool:
+    """Beyond doubt."""
     return mode["degrees"] > _WRONG[0] or mode["tolerances"] > _WRONG[1]
 
 
@@ -242,7 +247,8 @@ def _above(scores: np.ndarray, right: np.ndarray) -> str:
     return f"{(scores[right == 1] > best).mean():.2f}" if right.any() else "-"
 
 
-def _quality(numbers: Any, kinds: list[Examples]) -> str:
+def quality(numbers: Any, kinds: list[Examples]) -> str:
+    """Loss and AUC of weights, two cells of a table."""
     told = _joined(kinds)
     scores = _scores(numbers, told)
     loss = _alike(kinds) @ np.logaddexp(0, -(2 * told.right - 1) * scores)

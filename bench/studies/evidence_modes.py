@@ -10,8 +10,6 @@ from jax import lax
 
 from bench.studies.evidence_pairs import Pair
 from jaxreg import ParticleFilter, Status, register
-from jaxreg.geometry import lie
-from jaxreg.matching import evidence
 from jaxreg.neighbours import BruteForce
 from jaxreg.particle.conclude import Pair as Prepared
 from jaxreg.registrar import prepare_pair
@@ -73,16 +71,11 @@ def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, ...]:
     ready = prepare_pair(ParticleFilter(), tuple(map(jnp.asarray, clouds)))
     index = BruteForce.build(ready.target.points, ready.target.mask)
     witness = Prepared.of(ready.source, ready.target, index).judged.exact.witness
-    (there, back), (own, other) = witness.problems, witness.spacings
 
     def of_pose(T: jax.Array) -> tuple[jax.Array, ...]:
-        to = evidence._one_way(there, T, own, other, witness.shares[0], witness.chance)
-        fro = evidence._one_way(
-            back, lie.inverse(T), other, own, witness.shares[1], witness.chance
-        )
-        gain = jnp.maximum((to.gain + fro.gain) / 2, evidence._LEAST_GAIN)
-        near = jnp.sqrt(to.near * fro.near)
-        firm = [x.grip.firmness(witness.radius) for x in (to, fro)]
-        return jnp.log(gain), near, jnp.minimum(*firm), to.grip.holds
+        there, back = witness._ways(T[None], jnp.ones(1, bool))
+        said = witness._said(there, back)
+        told = said.log_gain, said.near, said.firm, there.grip.holds
+        return tuple(x[0] for x in told)
 
     return lax.map(of_pose, jax.vmap(ready.frames.enter)(T))

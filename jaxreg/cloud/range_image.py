@@ -9,7 +9,7 @@ a scanner that turns. In 2D the map is the angle.
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.typing import Mask, Points
 
@@ -30,6 +30,8 @@ class RangeImage(eqx.Module):
         viewpoint: `(d,)` in the frame of the points.
         axes: `(d, d)` rows; the first is the mean direction of the points.
         cells_per_unit: cells of the grid in a unit of the projection.
+        across: cells along an axis that are in use: as few as there are points for, of
+            a cloud with padding.
         nearest: `(g, ..)` of d - 1 axes: the least range in a cell and its neighbours;
             -inf where that is not known.
     """
@@ -37,6 +39,7 @@ class RangeImage(eqx.Module):
     viewpoint: Float[Array, "*b d"]
     axes: Float[Array, "..."]
     cells_per_unit: Float[Array, "*b"]
+    across: Float[Array, "*b"]
     nearest: Float[Array, "..."]
 
     @classmethod
@@ -52,17 +55,27 @@ class RangeImage(eqx.Module):
         axes = _axes_along(jnp.sum(unit, axis=0))
         place = _projected(axes, unit)
         extent = jnp.max(jnp.where(mask[:, None], jnp.abs(place), 0))
-        num = max(round((len(mask) / _POINTS_PER_CELL) ** (1 / (d - 1))), 3)
+        full, power = len(mask) / _POINTS_PER_CELL, 1 / (d - 1)
+        num = max(round(full**power), 3)
+        across = jnp.round((full * jnp.mean(mask)) ** power)
+        across = jnp.clip(across, 3, num).astype(points.dtype)
         image = cls(
             viewpoint,
             axes,
-            num / (_MARGIN * 2 * jnp.maximum(extent, 1e-6)),
+            across / (_MARGIN * 2 * jnp.maximum(extent, 1e-6)),
+            across,
             jnp.full((num,) * (d - 1), jnp.inf, points.dtype),
         )
         cell = image._cells(place)
         cell = tuple(jnp.where(mask, c, num) for c in cell)
         nearest = image.nearest.at[cell].min(length, mode="drop")
         return eqx.tree_at(lambda i: i.nearest, image, _around(nearest))
+
+    @property
+    def known(self) -> Bool[Array, "*b"]:
+        """Whether anything is."""
+        axes = tuple(range(self.viewpoint.ndim - 1, self.nearest.ndim))
+        return jnp.any(jnp.isfinite(self.nearest), axis=axes)
 
     def depth_before(self, points: Float[Array, "d n"]) -> Float[Array, " n"]:
         """How far points lie before the surface along their rays; -inf if not known.
@@ -79,9 +92,10 @@ class RangeImage(eqx.Module):
 
     def _cells(self, place: Float[Array, "n e"]) -> tuple[Array, ...]:
         num = self.nearest.shape[-1]
-        cell = jnp.floor(place * self.cells_per_unit + num / 2).astype(jnp.int32)
+        cell = jnp.floor(place * self.cells_per_unit + self.across / 2)
         # Outside is beyond the last: a negative number would count from the end.
-        return tuple(jnp.where((cell < 0) | (cell >= num), num, cell).T)
+        outside = (cell < 0) | (cell >= self.across)
+        return tuple(jnp.where(outside, num, cell.astype(jnp.int32)).T)
 
 
 def _axes_along(direction: Float[Array, " d"]) -> Float[Array, "d d"]:

@@ -12,28 +12,8 @@ points that lie on the surface, with a width s and a concentration k of their no
 and points that are anywhere beside it. (Where both clouds fill a volume, chance alone
 puts points near the other's samples, and 1 / 6 is more within a spacing and less
 beyond: `jaxreg.matching.chance`.) Directions count alike however many points show
-them: the ground is most of what a lidar sees, and it fits nearly everywhere. Three
-numbers of both ways are left,
-
-    gain    the mean of log p(u, c) / p(u, c; w = 0): how much better than chance the
-            points lie, in nats a point,
-    near    the share of the points beside that are within one spacing of the plane:
-            surfaces that touch by chance part again,
-    firm    how firmly the points on the surface hold the pose, the logarithm of a
-            volume of motions (`Grip.firmness`), the looser of both ways: what holds
-            loosely, a wall or a small patch, fits in many wrong poses.
-
-The logarithm of the odds of a right pose against the best wrong one is taken to be
-linear in them (logistic regression on pairs of scans):
-
-    log_evidence = _GAIN log gain + _NEAR near + _FIRM firm - _OFFSET
-
-at equal odds before. A wall on a wall, or a sphere on itself, coincides wherever it
-slips to: whether it does is told by a regression on the first two (`contact`). Nothing
-here is a length or a density of points, so lidar, RGB-D and scanned objects share the
-weights. They were found on clouds thinned to 4,096 points, and searches judge by as
-many; how, and what they say of data that they were not found on:
-bench/studies/evidence.md.
+them: the ground is most of what a lidar sees, and it fits nearly everywhere. What is
+left are numbers of both ways; `jaxreg.matching.odds` says what they are worth.
 """
 
 import equinox as eqx
@@ -52,6 +32,7 @@ from jaxreg.geometry import lie
 from jaxreg.matching.chance import near_by_chance
 from jaxreg.matching.directions import balanced
 from jaxreg.matching.mixture import Beside, Mixture
+from jaxreg.matching.odds import Said
 from jaxreg.matching.problem import Problem, match
 from jaxreg.matching.slippage import Grip
 from jaxreg.neighbours import AbstractIndex, BruteForce
@@ -61,14 +42,6 @@ from jaxreg.neighbours import AbstractIndex, BruteForce
 LIKELY = 1.0
 #: Of poses that are none: less than any pose has.
 NO_EVIDENCE = -100.0
-# The regression; `near` weighs like 20 independent places of which 95 % of those of a
-# right pose are near and 80 % of those of a wrong one.
-_GAIN, _NEAR, _FIRM, _OFFSET = 4.0, 28.0, 1.8, 23.3
-# That without `firm`, on all data but views of a room, whose walls coincide at wrong
-# poses, too.
-_CONTACT_GAIN, _CONTACT_NEAR, _CONTACT_OFFSET = 2.3, 38.0, 34.8
-# A gain so small is none: the mixture found nothing on the surface.
-_LEAST_GAIN = 0.05
 # Points of each cloud that are asked where all pairs are compared: 2 ms; twice as many
 # take 6, a third of an ICP on 2,000 points.
 _SOME = 512
@@ -103,9 +76,13 @@ class Evidence(eqx.Module):
 
 
 class _Way(eqx.Module):
-    """What the points of one cloud say: shares of it, and what evidence is made of."""
+    """What the points of one cloud say: shares of it, and what evidence is made of.
+
+    `seen` is the overlap, less for points in what the other scanner saw to be free.
+    """
 
     overlap: Float[Array, "*q"]
+    seen: Float[Array, "*q"]
     near: Float[Array, "*q"]
     gain: Float[Array, "*q"]
     fitness: Float[Array, "*q"]
@@ -175,6 +152,23 @@ class Witness(eqx.Module):
         self, T_target_source: Float[Array, "q D D"], used: Bool[Array, " q"]
     ) -> Evidence:
         """Of each pose in use, one after another; `NO_EVIDENCE` of the others."""
+        there, back = self._ways(T_target_source, used)
+        said = self._said(there, back)
+        d = T_target_source.shape[-1] - 1
+        return Evidence(
+            jnp.where(used, said.log_odds(d), NO_EVIDENCE),
+            jnp.where(used, said.contact(), NO_EVIDENCE),
+            there.overlap,
+            there.fitness,
+            there.rmse,
+            there.num,
+            there.grip,
+        )
+
+    def _ways(
+        self, T_target_source: Float[Array, "q D D"], used: Bool[Array, " q"]
+    ) -> tuple[_Way, _Way]:
+        """What either cloud says of each pose in use."""
         (there, back), (own, other) = self.problems, self.spacings
         T_source_target, chance = lie.inverse(T_target_source), self.chance
         forward = there, T_target_source, own, other, self.shares[0], chance
@@ -190,7 +184,19 @@ class Witness(eqx.Module):
 
             return shared(lambda poses: lax.map(one, poses), (T, used))
 
-        return _of_both(*on_both(ways, forward, backward), self.radius, used)
+        return on_both(ways, forward, backward)
+
+    def _said(self, there: _Way, back: _Way) -> Said:
+        """The numbers that both ways leave."""
+        viewed = [x.seen is not None and x.seen.known for x in self.problems]
+        grips = jax.tree.map(lambda *x: jnp.stack(x), there.grip, back.grip)
+        return Said(
+            gain=(there.gain + back.gain) / 2,
+            near=_root(there.near * back.near),
+            firm=jnp.min(grips.firmness(self.radius), axis=0),
+            seen=(there.seen, back.seen),
+            viewed=jnp.asarray(viewed[0]) & jnp.asarray(viewed[1]),
+        )
 
     def of_pose(self, T_target_source: Motion) -> Evidence:
         """Of one pose.
@@ -228,33 +234,13 @@ def _one_way(
     total = jnp.maximum(total, 1)
     return _Way(
         overlap=near / total,
+        seen=near / (total + _AGAINST * before),
         near=near / jnp.maximum(said + _AGAINST * before, 1),
         gain=gain,
         fitness=num / total,
         rmse=_root(sq / jnp.maximum(num, 1)),
         num=num.astype(jnp.int32),
         grip=Grip.of(found, moved, on),
-    )
-
-
-def _of_both(
-    there: _Way, back: _Way, radius: Scalar, used: Bool[Array, " q"]
-) -> Evidence:
-    gain = jnp.maximum((there.gain + back.gain) / 2, _LEAST_GAIN)
-    near = _root(there.near * back.near)
-    grips = jax.tree.map(lambda *x: jnp.stack(x), there.grip, back.grip)
-    firm = jnp.min(grips.firmness(radius), axis=0)
-    gain = jnp.log(gain)
-    log_evidence = _GAIN * gain + _NEAR * near + _FIRM * firm - _OFFSET
-    contact = _CONTACT_GAIN * gain + _CONTACT_NEAR * near - _CONTACT_OFFSET
-    return Evidence(
-        jnp.where(used, log_evidence, NO_EVIDENCE),
-        jnp.where(used, contact, NO_EVIDENCE),
-        there.overlap,
-        there.fitness,
-        there.rmse,
-        there.num,
-        there.grip,
     )
 
 
@@ -274,7 +260,7 @@ def _nothing(T: Motion) -> _Way:
     zero, d = jnp.zeros((), T.dtype), T.shape[-1] - 1
     k = d * (d + 1) // 2
     grip = Grip(jnp.zeros((k, k), T.dtype), jnp.zeros(d, T.dtype), zero)
-    return _Way(zero, zero, zero, zero, zero, jnp.zeros((), jnp.int32), grip)
+    return _Way(zero, zero, zero, zero, zero, zero, jnp.zeros((), jnp.int32), grip)
 
 
 def _num_before(
