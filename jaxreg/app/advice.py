@@ -33,7 +33,8 @@ _AT_TERMINAL = {
     Status.DISCONNECTED: (
         "Not all hang together by motions that are trusted: those that do with the "
         "first, or the most, are placed, others in parts of their own. Add scans "
-        "between them, or trust motions that you have looked at (jaxreg average "
+        "between them, tell where the scanner stood in its scans (--viewpoint 0 0 0, "
+        "in 2D 0 0), or trust motions that you have looked at (jaxreg average "
         "--force I,J)."
     ),
     Status.UNIT_DIFFERS: (
