@@ -26,6 +26,16 @@ class Lidar(NamedTuple):
         self, walls: np.ndarray, T_world_scan: np.ndarray, rng: np.random.Generator
     ) -> np.ndarray:
         """`(n, 2)` what it sees of walls `(w, 2, 2)`, about itself."""
+        own, length = self.lengths(walls, T_world_scan)
+        nearest = np.min(length, axis=1)
+        seen = nearest < self.reach
+        told = nearest[seen] + rng.normal(0, self.noise, seen.sum())
+        return told[:, None] * own[seen]
+
+    def lengths(
+        self, walls: np.ndarray, T_world_scan: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Its rays `(r, 2)`, and `(r, w)` how far each goes to a wall or inf."""
         half = self.field / 2
         angle = np.linspace(-half, half, self.num_rays, endpoint=False)
         own = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -36,10 +46,7 @@ class Lidar(NamedTuple):
         across = np.where(np.abs(across) < 1e-12, 1e-12, across)
         length, place = _cross(start, along) / across, _cross(start, ray) / across
         met = (place >= 0) & (place <= 1) & (length > 0)
-        nearest = np.min(np.where(met, length, np.inf), axis=1)
-        seen = nearest < self.reach
-        told = nearest[seen] + rng.normal(0, self.noise, seen.sum())
-        return told[:, None] * own[seen]
+        return own, np.where(met, length, np.inf)
 
 
 class Floor(NamedTuple):

@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 import pytest
+
 from bench.studies.flat_pairs import Pair, strangers
 from bench.studies.flat_scenes import Floor, Lidar
-
 from jaxreg import Status, reconstruct, register
 
 
