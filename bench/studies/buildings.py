@@ -1,4 +1,4 @@
-"""Floors of a building in 3D, as a lidar that spins or sweeps sees them.
+"""Floors of a building in 3D, as a lidar that spins sees them.
 
 The rooms of `bench.studies.flat_scenes` with a floor, a ceiling and furniture of some
 height: walls, boxes and nothing else.
@@ -12,9 +12,8 @@ from bench.studies.flat_scenes import Floor, Lidar
 
 
 _TALL, _HEIGHTS = 2.6, (0.45, 0.75, 1.1, 1.9)
-#: Elevations of the rays, in radians.
+#: Elevations of the rays of a lidar that spins, in radians.
 SPINS = np.deg2rad(np.linspace(-25, 15, 32))
-SWEEPS = np.deg2rad(np.linspace(-60, 60, 64))
 
 
 class Building(NamedTuple):

@@ -79,9 +79,11 @@ def main() -> None:
 def discriminants(examples: dict[str, Examples]) -> Iterator[str]:
     """Found on one half, checked on the other; and without one kind after another."""
     told = {k: x for k, x in examples.items() if k not in CHECKED}
+    if not told:
+        return
     choose = [x if k in GENERATED else x.of_half(0) for k, x in told.items()]
     check = [x.of_half(1) for k, x in told.items() if k not in GENERATED]
-    unseen = [x for k, x in examples.items() if k in CHECKED]
+    apart = {k: [x] for k, x in examples.items() if k in CHECKED}
     every, found = list(told.values()), fitted(choose)
     code = odds._GAIN, odds._NEAR, odds._FIRM, -odds._OFFSET
     yield "| | log gain | near | firm | offset | examples | loss | AUC |"
@@ -89,10 +91,10 @@ def discriminants(examples: dict[str, Examples]) -> Iterator[str]:
     for name, numbers, kinds in (
         ("found on the first half", found, choose),
         ("checked on the second", found, check),
-        ("checked on other views", found, unseen),
+        *((f"checked on {kind}", found, x) for kind, x in apart.items()),
         ("in the code, all", code, every),
         ("in the code, second half", code, check),
-        ("in the code, other views", code, unseen),
+        *((f"in the code, {kind}", code, x) for kind, x in apart.items()),
         ("found on all", fitted(every), every),
     ):
         if kinds:

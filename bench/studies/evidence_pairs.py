@@ -9,6 +9,7 @@ import numpy as np
 
 from bench.motion_scans import SETS, load_scans
 from bench.room_views import room_views
+from bench.studies.buildings import SPINS, Building
 from bench.studies.streets import TOLERANCE, street_pair
 from bench.workloads import sensor_data
 from bench.workloads.filter_data import horse_model
@@ -143,6 +144,22 @@ def strangers(data: Path) -> Iterator[Pair]:
             yield Pair(f"bunny {i} on dragon {j}", bunny[i], dragon[j], None, 1.0)
 
 
+def rooms(data: Path) -> Iterator[Pair]:
+    """Walls, boxes and nothing else, by a lidar that spins; and of two buildings."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        building, other = Building.drawn(rng), Building.drawn(rng)
+        T = building.poses(60, rng)
+        for i in rng.integers(0, 57, 8):
+            target = building.scan(T[i], SPINS, rng)
+            for j in (i + 1, i + 3):
+                source = building.scan(T[j], SPINS, rng)
+                T_i_j = np.linalg.inv(T[i]) @ T[j]
+                yield Pair(f"rooms {seed} {i} {j}", source, target, T_i_j, 0.3)
+            stranger = other.scan(other.poses(1, rng)[0], SPINS, rng)
+            yield Pair(f"rooms {seed} {i} and others", stranger, target, None, 1.0)
+
+
 def _all_pairs(
     name: str, scans: list[np.ndarray], T_world_i: np.ndarray, tolerance: float
 ) -> Iterator[Pair]:
@@ -165,7 +182,8 @@ KINDS: dict[str, Callable[[Path], Iterator[Pair]]] = {
     "sequences": sequences,
     "sensors": sensors,
     "strangers": strangers,
+    "rooms": rooms,
 }
 GENERATED = "streets", "sculpture"
 #: Those that the regression does not see.
-CHECKED = ("other_views",)
+CHECKED = "other_views", "rooms"
