@@ -13,7 +13,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import numpy as np
 
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.checks import (
@@ -29,16 +28,16 @@ from jaxreg._core.log import log_solution, log_stage
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.averaging import AbstractAverager
 from jaxreg.averaging.world.adjusted import Told
-from jaxreg.multiview.choose_pairs import Order, all_pairs, first_pairs
+from jaxreg.multiview.choose_pairs import Order, all_pairs
 from jaxreg.multiview.conclude import finish
+from jaxreg.multiview.earlier import check_can_hold, known_before
 from jaxreg.multiview.given_scans import GivenScans
 from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.known_world import KnownWorld
 from jaxreg.multiview.positions import ScanPositions
 from jaxreg.multiview.prepare import prepare_scans
-from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.register_pairs import OnPairs, Rounds
-from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
+from jaxreg.multiview.relative_motions import relative_motions
 from jaxreg.multiview.scan_set import OUTSIDE, ScanSet
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.multiview.workers import Workers, check_executor
@@ -163,7 +162,7 @@ def reconstruct(
     check_instance(averaging, "averaging", AbstractAverager | None)
     known = KnownWorld.of(priors, fixed, control, levels, shape, given.dtype)
     if hold_previous:
-        _check_can_hold(previous, known)
+        check_can_hold(previous, known)
     if positions is not None:
         positions.check_fits(shape, method)
         positions = cast_floats(positions, given.dtype)
@@ -242,7 +241,7 @@ def _of_chosen_pairs(
     prepared, said = given.prepared(method, positions, to_search=order == "any")
     report("preparing scans", 1, 1)
     words = None if said is None else said.used
-    before, first = _known(previous, prepared, order, words)
+    before, first = known_before(previous, prepared, order, words)
     hold = None
     if hold_previous and isinstance(previous, ReconstructionSolution):
         hold = Held.of(previous, prepared)
@@ -280,55 +279,6 @@ def _of_all_pairs(
     method, held = jax.lax.stop_gradient((method, prepared))
     motions = relative_motions(method, held, pairs, key)
     return finish(method, averaging, prepared, motions, None, known)
-
-
-def _known(
-    previous: object,
-    scans: PreparedScans,
-    order: Order,
-    words: np.ndarray | None,
-) -> tuple[RelativeMotions | None, np.ndarray | None]:
-    """Motions in the centred frames, and the pairs to begin with, None for the usual.
-
-    Those of an earlier solution and those that join new scans to each other and to it.
-    """
-    if previous is None:
-        return None, None
-    earlier = previous if isinstance(previous, ReconstructionSolution) else None
-    motions = previous if earlier is None else earlier.motions
-    if not isinstance(motions, RelativeMotions):
-        raise TypeError(
-            "previous: wanted a ReconstructionSolution or RelativeMotions, found "
-            f"{type(previous).__name__}."
-        )
-    if motions.T_i_j.shape[-1] != scans.mean.shape[-1] + 1:
-        raise ValueError("previous: of another dimension than the scans.")
-    num_old = (
-        earlier.num_scans if earlier is not None else 1 + int(np.max(motions.pairs))
-    )
-    if num_old > scans.num_present:
-        raise ValueError(
-            f"previous: of {num_old} scans, but there are {scans.num_present}."
-        )
-    first = None
-    if earlier is not None:
-        rng = np.random.default_rng(num_old)
-        new = first_pairs(scans.num_present, order, rng, words, num_old)
-        first = np.concatenate([motions.pairs, new])
-        first = np.unique(first, axis=0)
-    return motions.heard(scans), first
-
-
-def _check_can_hold(previous: object, known: KnownWorld | None) -> None:
-    if not isinstance(previous, ReconstructionSolution):
-        raise ValueError(
-            "hold_previous: wanted a ReconstructionSolution as previous, found "
-            f"{type(previous).__name__}."
-        )
-    if known is not None or previous.prior_weight is not None:
-        raise ValueError(
-            "hold_previous: in a world that is known give the poses to hold as fixed=."
-        )
 
 
 def _checked(order: str) -> Order:
