@@ -124,7 +124,8 @@ def _draw_flat(
     colors: np.ndarray,
     first: bool,
 ) -> None:
-    size = float(np.clip(400 / np.sqrt(max(len(x) for x in before)), 2, 7))
+    # Of many scans smaller ones: walls of a floor are lines, not bars.
+    size = float(np.clip(250 / np.sqrt(sum(map(len, before)) / 2), 1.5, 7))
     for k, color in enumerate(colors):
         # Later ones smaller, so that points which coincide are both seen.
         s = size * (1.3 - 0.7 * k / max(len(colors) - 1, 1))
