@@ -136,7 +136,9 @@ def _call(command: list[str], folder: str, cache: str) -> str:
     environment = os.environ | {"XDG_CACHE_HOME": cache}
     # The library that is measured here, whatever else is installed.
     environment["PYTHONPATH"] = str(Path(jaxreg.__file__).parents[1])
-    for name in ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64"):
+    # As installed: there the library's modules are bytecode from the second run on.
+    unset = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "PYTHONDONTWRITEBYTECODE"
+    for name in unset:
         environment.pop(name, None)
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True

@@ -2,14 +2,17 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from jaxreg._core.programs import keep_programs
 
 
-# Programs that compile in less are compiled again.
+# Programs that compile in less are compiled again. By itself JAX keeps those of a second
+# and more: of the fifteen of `jaxreg average` three.
 _LEAST_SECONDS = 0.05
+_LEAST = "jax_persistent_cache_min_compile_time_secs"
 
 
 def cache(folder: str | Path | None = None) -> Path:
@@ -20,7 +23,8 @@ def cache(folder: str | Path | None = None) -> Path:
     of methods with parts of other code than this package are compiled ones only.
 
     Call it before the first program is compiled. It sets JAX's configuration for the
-    whole process, and so nothing but a call of it does.
+    whole process, and so nothing but a call of it does. Kept is what takes 50 ms or
+    more to compile, unless `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` says otherwise.
 
     Args:
         folder: made if needed. By default `JAX_COMPILATION_CACHE_DIR` of the
@@ -36,8 +40,10 @@ def cache(folder: str | Path | None = None) -> Path:
         OSError: if it cannot be made.
     """
     named = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    least = {} if _LEAST.upper() in os.environ else {_LEAST: _LEAST_SECONDS}
     if folder is None and named:  # JAX keeps them there without being told again
         folder = Path(named).absolute()
+        _configure(least)
         keep_programs(folder / "programs" if _may_keep(folder) else None)
         return Path(named)
     if folder is None:
@@ -51,10 +57,14 @@ def cache(folder: str | Path | None = None) -> Path:
             f"{folder}: others may write there, compiled programs are not kept. Remove "
             "it, or make it yours alone."
         )
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST_SECONDS)
+    _configure({"jax_compilation_cache_dir": str(folder)} | least)
     keep_programs(folder / "programs")
     return folder
+
+
+def _configure(settings: dict[str, Any]) -> None:
+    for name, value in settings.items():
+        jax.config.update(name, value)
 
 
 def _may_keep(folder: Path) -> bool:

@@ -44,6 +44,12 @@ def test_programs_are_kept_where_one_says(
     used: dict[str, object] = {}
     monkeypatch.setattr(jax.config, "update", used.__setitem__)
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "named"))
+    least = "jax_persistent_cache_min_compile_time_secs"
+    monkeypatch.delenv(least.upper(), raising=False)
+    assert jaxreg.cache() == tmp_path / "named"
+    assert used == {least: 0.05}
+    used.clear()
+    monkeypatch.setenv(least.upper(), "2")
     assert jaxreg.cache() == tmp_path / "named"
     assert used == {}
     assert jaxreg.cache(tmp_path / "a" / "given") == tmp_path / "a" / "given"
