@@ -25,6 +25,24 @@ def data_dir(*parts: str) -> Path:
 
 
 @contextmanager
+def compiled() -> Iterator[list[str]]:
+    """Names of functions, as they are compiled meanwhile."""
+    import jax
+
+    names: list[str] = []
+
+    def hear(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event.endswith("backend_compile_duration"):
+            names.append(str(kwargs["fun_name"]))
+
+    jax.monitoring.register_event_duration_secs_listener(hear)
+    try:
+        yield names
+    finally:
+        jax.monitoring.unregister_event_duration_listener(hear)
+
+
+@contextmanager
 def switched_on(*names: str, to: bool = True) -> Iterator[None]:
     """With settings of JAX that are off by default, or off with `to=False`."""
     import jax

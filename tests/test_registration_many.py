@@ -6,7 +6,7 @@ from itertools import pairwise
 import jax
 import numpy as np
 import pytest
-from helpers import motion
+from helpers import compiled, motion
 from pairs import BESL_MCKAY, FILTER, Centroids, M, N, pair
 
 import jaxreg as jr
@@ -14,18 +14,11 @@ from jaxreg import Status
 from jaxreg.registration import many
 
 
-@pytest.fixture
-def compiled():
+@pytest.fixture(name="compiled")
+def _compiled():
     """Names of functions, as they are compiled."""
-    names = []
-
-    def hear(event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event.endswith("backend_compile_duration"):
-            names.append(str(kwargs["fun_name"]))
-
-    jax.monitoring.register_event_duration_secs_listener(hear)
-    yield names
-    jax.monitoring.unregister_event_duration_listener(hear)
+    with compiled() as names:
+        yield names
 
 
 def _ragged(num: int):

@@ -9,8 +9,8 @@ import jax
 from jaxreg._core.programs import keep_programs
 
 
-# Programs that compile in less are compiled again. By itself JAX keeps those of a second
-# and more: of the fifteen of `jaxreg average` three.
+# Programs that compile in less are compiled again. By itself JAX keeps those that take
+# a second: three of the fifteen of `jaxreg average`.
 _LEAST_SECONDS = 0.05
 _LEAST = "jax_persistent_cache_min_compile_time_secs"
 

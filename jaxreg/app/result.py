@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.status import Status
@@ -229,7 +228,7 @@ def write_result(
         graph = _trusted_graph(result, ids)
         # Files keep the digits of float64 whatever the precision of the computation.
         with jax.enable_x64(True):
-            T_world_i = jnp.asarray(_rigid(result.T_world_i[ids]))
+            T_world_i = jax.device_put(_rigid(result.T_world_i[ids]))
             write_tum(folder / file_of("poses.tum", k), T_world_i, timestamps=ids)
             write_g2o(folder / file_of("graph.g2o", k), graph, T_world_i, ids)
 

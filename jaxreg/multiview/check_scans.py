@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -50,7 +51,7 @@ def padded_scans(
         dtype = jnp.result_type(*arrays)
         lengths = np.array([len(x) for x in arrays])
         rows = num_rows or rounded_up(max(lengths.tolist()))
-        row_mask = jnp.asarray(np.arange(rows) < lengths[:, None])
+        row_mask = jax.device_put(np.arange(rows) < lengths[:, None])
         return stacked([x.astype(dtype) for x in arrays], rows), row_mask
     points = as_float_array(scans, "scans")
     check_points(points, "scans")

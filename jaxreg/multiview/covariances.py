@@ -11,6 +11,7 @@ with each other may be wrong together.
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -65,9 +66,10 @@ def scan_covariances(
     Reference: Huber 1967; Conley 1999 (errors that neighbours share).
     """
     prepared, T, told, held = _asked(scans, solution, relative_to, mask)
-    out = _covariances(prepared, T, *told)[: len(held)]
-    out = jnp.where(jnp.asarray(held)[:, None, None], out, jnp.nan)
-    return out.at[relative_to].set(0)
+    # The rest on the host: there no program is compiled for each number.
+    out = np.array(_covariances(prepared, T, *told))[: len(held)]
+    out[~held], out[relative_to] = np.nan, 0
+    return jax.device_put(out)
 
 
 def joint_scan_covariances(
@@ -99,10 +101,10 @@ def joint_scan_covariances(
     Reference: see `scan_covariances`.
     """
     prepared, T, told, held = _asked(scans, solution, relative_to, mask)
-    out = _joint_covariances(prepared, T, *told)[: len(held), : len(held)]
-    both = jnp.asarray(held[:, None] & held)
-    out = jnp.where(both[:, :, None, None], out, jnp.nan)
-    return out.at[relative_to].set(0).at[:, relative_to].set(0)
+    out = np.array(_joint_covariances(prepared, T, *told))[: len(held), : len(held)]
+    out[~held], out[:, ~held] = np.nan, np.nan
+    out[relative_to], out[:, relative_to] = 0, 0
+    return jax.device_put(out)
 
 
 def _asked(
@@ -134,21 +136,21 @@ def _asked(
     prepared, _ = given.prepared(ParticleFilter(), None, to_search=False)
     T = np.tile(np.eye(d + 1), (prepared.num_scans, 1, 1))
     T[:v] = np.asarray(moved.T_world_i, np.float64)
-    T = jnp.asarray(np.linalg.inv(T[relative_to]) @ T, given.dtype)
+    T = (np.linalg.inv(T[relative_to]) @ T).astype(given.dtype)
     edges, weight = _pairs(moved, relative_to)
     held = np.zeros(v, bool)
     held[edges[weight > 0].ravel()] = True
-    weight = jnp.asarray(weight, given.dtype)
-    return prepared, T, (jnp.asarray(relative_to), jnp.asarray(edges), weight), held
+    told = np.int32(relative_to), edges, weight.astype(given.dtype)
+    return prepared, *jax.device_put((T, told)), held
 
 
 def _pairs(
     solution: ReconstructionSolution, first: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Averaged pairs of a scan's component, and weights; padded so that few compile."""
-    component, edges = solution.component, np.asarray(solution.averaged.pairs)
-    weight = np.asarray(solution.averaged.weight)
-    held = (np.asarray(component)[edges] == int(component[first])).all(axis=1)
+    averaged, component = solution.averaged, np.asarray(solution.component)
+    edges, weight = np.asarray(averaged.pairs), np.asarray(averaged.weight)
+    held = (component[edges] == component[first]).all(axis=1)
     used = held & (weight > 0) & (edges[:, 0] != edges[:, 1])
     weight = weight[used]
     more = rounded_up(len(weight), 8) - len(weight)

@@ -7,6 +7,7 @@ then are one; and so on.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from jaxreg._core import control
@@ -44,7 +45,7 @@ def slipping(
         return _grips(placement, block, told, least)
 
     grips = in_blocks(run, pairs, (scans, placement))
-    body = jnp.arange(scans.num_scans, dtype=jnp.int32)
+    body = jax.device_put(np.arange(scans.num_scans, dtype=np.int32))
     if held is not None:
         body = jnp.where(held, jnp.argmax(held).astype(jnp.int32), body)
     return _apart(pairs, grips, placement.part, body)

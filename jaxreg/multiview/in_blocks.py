@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
@@ -58,7 +57,7 @@ def _finished(run: Callable[[Array], Tree], block: Array) -> Tree:
 def _rows(parts: Sequence[Tree], rows: np.ndarray) -> Tree:
     """Some rows of all blocks."""
 
-    def of(*x: Array) -> Array:
-        return jnp.asarray(np.concatenate([np.asarray(y) for y in x])[rows])
+    def of(*x: Array) -> np.ndarray:
+        return np.concatenate(list(map(np.asarray, x)))[rows]
 
-    return jax.tree.map(of, *parts)
+    return jax.device_put(jax.tree.map(of, *parts))

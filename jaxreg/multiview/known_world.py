@@ -65,9 +65,10 @@ class KnownWorld(eqx.Module):
         if all(x is None for x in (priors, fixed, control, levels)):
             return None
         num_scans, d = shape
-        eye, one = jnp.eye(d + 1, dtype=dtype)[None], jnp.ones(1, dtype)
-        frames = jnp.zeros((1, 2), jnp.int32)
-        blank = PoseGraph(frames, eye, one, one > 0, None, num_scans)
+        edges, eye = np.zeros((1, 2), np.int32), np.eye(d + 1, dtype=dtype)[None]
+        parts = edges, eye, np.ones(1, dtype), np.ones(1, bool)
+        frames, eye, one, mask = map(jax.device_put, parts)
+        blank = PoseGraph(frames, eye, one, mask, None, num_scans)
         known = check_known(priors, fixed, control, levels, blank, padded=True)
         return None if known is None else cls(known)
 

@@ -113,7 +113,7 @@ class LikelyOverlap:
             return out
         row = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         moved = np.abs(T_i_j - self._T_i_j[row]).sum(axis=(1, 2))
-        least = _STILL * float(self._scans.coarsest)
+        least = _STILL * float(_coarsest(self._scans))
         still = (self._keys[row] == keys) & (moved <= least)
         out[still] = self._overlap[row[still]]
         return out
@@ -126,6 +126,11 @@ class LikelyOverlap:
         self._keys = keys[order]
         self._T_i_j = np.concatenate([self._T_i_j[stays], T])[order]
         self._overlap = np.concatenate([self._overlap[stays], overlap])[order]
+
+
+@kept_program
+def _coarsest(scans: PreparedScans) -> Scalar:
+    return scans.coarsest
 
 
 def likely_overlap(

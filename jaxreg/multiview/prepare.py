@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core.programs import kept_program
@@ -156,8 +157,8 @@ def gathered(
         feature_spacing=spacing,
         fault=scan.fault,
         num_dropped=scan.num_dropped,
-        ids=jnp.arange(len(scan.fault), dtype=jnp.int32),
-        count=jnp.asarray(num, jnp.int32),
+        ids=jax.device_put(np.arange(len(scan.fault), dtype=np.int32)),
+        count=jax.device_put(np.int32(num)),
         positions=positions,
     )
 

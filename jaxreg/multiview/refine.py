@@ -76,8 +76,8 @@ def refine(
     motions = measured(scans, placement, least, pairs, exact=False)
     placement = _updated(placement, averaged(motions, placement))
     motions = measured(scans, placement, least, pairs, exact=True)
-    optimiser, width = optimiser_of(motions.T_i_j), widths_of(moving, placement)[-1]
-    motions = follow_points(moving, motions, optimiser, width, least)
+    told = optimiser_of(motions.T_i_j), _last_width(moving, placement), least
+    motions = follow_points(moving, motions, *told)
     average = averaged(motions, placement)
     counted = AveragedPairs.of(motions, average, least)
     return _updated(placement, average), motions, counted
@@ -157,6 +157,11 @@ def optimiser_of(like: Array) -> LocalOptimiser:
     """What the steps are by, in the dtype of the poses."""
     optimiser = LocalOptimiser(PlaneToPlane(0.01), GemanMcClure(), GaussNewton())
     return cast_floats(optimiser, like.dtype)
+
+
+@kept_program
+def _last_width(scans: PreparedScans, placement: Placement) -> Scalar:
+    return widths_of(scans, placement)[-1]
 
 
 def widths_of(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core.brief import BriefModule
 from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
-from jaxreg._core.typing import ArrayLike, Key
+from jaxreg._core.typing import Key
 from jaxreg.batching.side_by_side import map_side_by_side
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.method import num_kept, solve
@@ -120,17 +120,19 @@ class RelativeMotions(BriefModule):
         )
 
     def padded(self, num: int) -> "RelativeMotions":
-        """With pairs of scan 0 and itself that do not overlap, to so many."""
-        more = num - len(self.overlap)
+        """With pairs of scan 0 and itself that do not overlap, to so many.
 
-        def pad(x: ArrayLike) -> Array:
-            x = jnp.asarray(x)
-            return jnp.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1))
+        On the host: there no program is compiled for each number.
+        """
+        known = len(self.overlap)
 
-        real = jnp.arange(num)[:, None] < len(self.overlap)
+        def pad(x: Array | np.ndarray) -> np.ndarray:
+            rows = [(0, num - known)] + [(0, 0)] * (x.ndim - 1)
+            return np.pad(np.asarray(x), rows)
+
         out = jax.tree.map(pad, self)
-        told = jnp.where(real, out.log_evidence, NO_EVIDENCE)
-        return eqx.tree_at(lambda m: m.log_evidence, out, told)
+        out.log_evidence[known:] = NO_EVIDENCE
+        return jax.device_put(out)
 
     @staticmethod
     def joined(some: list["RelativeMotions"]) -> "RelativeMotions":

@@ -90,7 +90,7 @@ class ReconstructionSolution(eqx.Module):
             of_pairs = s.overlap, s.edge_weight, s.inlier_rmse, s.mode
             return *of_graph, *of_pairs, s.motions
 
-        parts = jax.tree.map(lambda x: x[:num], pairs_of(self))
+        parts = _first(pairs_of(self), num)
         return eqx.tree_at(pairs_of, self, parts)
 
     def of_scans(self, num: int) -> "ReconstructionSolution":
@@ -100,7 +100,7 @@ class ReconstructionSolution(eqx.Module):
             poses = s.T_world_i, s.scan_status, s.placed
             return *poses, s.component, s.num_dropped
 
-        parts = jax.tree.map(lambda x: x[:num], scans_of(self))
+        parts = _first(scans_of(self), num)
         graph = dataclasses.replace(self.graph, num_poses=num)
         return eqx.tree_at(lambda s: (*scans_of(s), s.graph), self, (*parts, graph))
 
@@ -123,3 +123,8 @@ class ReconstructionSolution(eqx.Module):
             f"{int(jnp.sum(self.edge_weight > 0.5))} of {self.overlap.size} pairs "
             "trusted)"
         )
+
+
+def _first(parts: tuple[object, ...], num: int) -> tuple[object, ...]:
+    """The first rows, cut on the host: there no program is compiled for each number."""
+    return jax.device_put(jax.tree.map(lambda x: np.asarray(x)[:num], parts))

@@ -1,12 +1,10 @@
 """Lists of graphs of unequal sizes."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import compiled
 
 import jaxreg as jr
 from jaxreg import Status
@@ -19,22 +17,6 @@ from tests.averaging.graphs import motions, random_graph, rotations
 # Right motions of each frame outnumber wrong ones: rounding decides if they do not.
 SIZES = [(9, 24), (10, 30), (7, 15)]
 PLAIN = jr.MotionAveraging()
-
-
-@contextmanager
-def _compiled() -> Iterator[list[str]]:
-    """Names of what is compiled meanwhile."""
-    names = []
-
-    def hear(event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event.endswith("backend_compile_duration"):
-            names.append(str(kwargs["fun_name"]))
-
-    jax.monitoring.register_event_duration_secs_listener(hear)
-    try:
-        yield names
-    finally:
-        jax.monitoring.unregister_event_duration_listener(hear)
 
 
 def _graphs(sizes, outliers: float = 0.1, d: int = 3):
@@ -64,7 +46,7 @@ def test_a_hundred_sizes_compile_once_a_bucket_and_settings_never():
     sizes = [(10 + k % 4, 16 + k // 4) for k in range(100)]
     graphs = _graphs(sizes, outliers=0.0, d=2)
     programs, other = many._average_lanes, jr.MotionAveraging(tolerance=1e-5)
-    with _compiled() as names:
+    with compiled() as names:
         found = jr.average(graphs, PLAIN)
         first = len(names)
         jr.average(graphs, other)
@@ -81,7 +63,7 @@ def test_single_graphs_of_similar_sizes_share_programs_and_keep_their_answers():
     starts = [_some_way_off(*n) for n in enumerate((12, 9, 10, 11))]
     jr.average(graphs[0], PLAIN, starts[0])
     jr.average(graphs[1], PLAIN, starts[1])
-    with _compiled() as names:
+    with compiled() as names:
         found = [
             jr.average(*gx) for gx in zip(graphs, [PLAIN] * 4, starts, strict=True)
         ]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import blob, half_noise, motion, move, pose_error
+from helpers import blob, compiled, half_noise, motion, move, pose_error
 
 import jaxreg as jr
 from jaxreg import Status, particle
@@ -73,6 +73,16 @@ def test_every_pair_is_reported_with_what_is_known_of_it(sculpture, solved):
         np.arange(len(pairs)), np.asarray(sol.mode)
     ]
     assert np.all(told[trusted] > 0)
+
+
+def test_a_solution_is_cut_to_any_number_of_pairs_and_scans_without_a_program(solved):
+    sol, _, _ = solved
+    with compiled() as names:
+        some = sol.of_pairs(5).of_scans(6)
+    assert names == []
+    assert some.T_world_i.shape[0] == some.graph.num_poses == 6
+    np.testing.assert_array_equal(some.graph.edges, sol.graph.edges[:5])
+    np.testing.assert_array_equal(some.motions.overlap, sol.motions.overlap[:5])
 
 
 def test_progress_names_stages_and_ends_at_the_total(solved):

@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import compiled
 
 import jaxreg as jr
+from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview import RelativeMotions
 from jaxreg.multiview.prepare import prepare_scans
 from jaxreg.testing.problems import motion, surface
@@ -35,3 +37,18 @@ def test_what_is_told_is_heard_to_the_last_bit(unit):
     ):
         assert mine.dtype == other.dtype
         np.testing.assert_array_equal(mine, other)
+
+
+def test_motions_are_padded_to_any_number_without_a_program():
+    ones = jnp.ones((5, 2))
+    T_i_j = jnp.broadcast_to(jnp.eye(3), (5, 2, 3, 3))
+    motions = RelativeMotions(jnp.ones((5, 2), jnp.int32), T_i_j, ones, ones, ones)
+    with compiled() as names:
+        found = [motions.on_host(slice(num)).padded(num + 4) for num in (2, 5)]
+    assert names == []
+    for num, out in zip((2, 5), found, strict=True):
+        assert out.pairs.shape == (num + 4, 2)
+        np.testing.assert_array_equal(out.log_evidence[:num], 1)
+        np.testing.assert_array_equal(out.log_evidence[num:], NO_EVIDENCE)
+        assert not out.pairs[num:].any()
+        assert not out.overlap[num:].any()

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 
 import jaxreg
@@ -21,7 +22,7 @@ def trace_curves(
         return None
     if isinstance(trace, jaxreg.SearchTrace):
         return _of_search(trace)
-    return _of_averaging(trace, num_steps)
+    return _of_averaging(jax.device_get(trace), num_steps)
 
 
 def _of_averaging(
