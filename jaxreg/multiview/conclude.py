@@ -20,16 +20,12 @@ from jaxreg.multiview.likely_overlap import LikelyOverlap
 from jaxreg.multiview.method import min_log_evidence
 from jaxreg.multiview.near_pairs import near_pairs
 from jaxreg.multiview.pair_trust import pair_trust
-from jaxreg.multiview.place import Placement, agreeing, place, prior_weight
+from jaxreg.multiview.place import Placement, agreeing, place, prior_weight, roughly
 from jaxreg.multiview.prepared_scans import PreparedScans
-from jaxreg.multiview.refine import refine
+from jaxreg.multiview.refine import VOUCHED, refine
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution
 from jaxreg.registrar import AbstractRegistrar
-
-
-# Poses that other pairs vouch for need less evidence of their own: odds of e^2.
-_VOUCHED = 2.0
 
 
 def finish(
@@ -55,12 +51,14 @@ def finish(
     moving, scans = scans, lax.stop_gradient(scans)
     least = jnp.asarray(min_log_evidence(method), scans.radius.dtype)
     if hold is None:
-        placement = place(motions, scans.num_scans, averaging, least, scans.count)
+        told = averaging, least, scans.count, None, roughly(least)
+        placement = place(motions, scans.num_scans, *told)
     else:
-        placement = hold.place(scans, motions, averaging, least)
+        told = averaging, least, roughly(least)
+        placement = hold.place(scans, motions, *told)
     mode, turns = placement.mode, turnable(motions, placement)
     pairs = near_pairs(scans, placement, motions, overlaps)
-    likely = least - _VOUCHED
+    likely = least - VOUCHED
     if hold is not None:
         pairs = hold.of_new(pairs)
         placement, averaged = hold.refine(scans, placement, averaging, likely, pairs)

@@ -18,7 +18,7 @@ from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.averaged_pairs import AveragedPairs
-from jaxreg.multiview.place import Placement, agreeing, place
+from jaxreg.multiview.place import Placement, agreeing, place, roughly
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import measured, wide_unless_given
 from jaxreg.multiview.relative_motions import RelativeMotions
@@ -68,6 +68,7 @@ class Held(eqx.Module):
         motions: RelativeMotions,
         averaging: AbstractAverager | None,
         least: Scalar,
+        within: Scalar | None = None,
     ) -> Placement:
         """Where all scans lie by what was found; averages what is new alone.
 
@@ -78,6 +79,7 @@ class Held(eqx.Module):
             motions: of pairs, some of them padding.
             averaging: as in `place`.
             least: log evidence of the pairs that count.
+            within: as in `place`.
         """
         pairs = np.asarray(motions.pairs)
         held, padding = np.asarray(self.held)[pairs], pairs[:, 0] == pairs[:, 1]
@@ -85,7 +87,8 @@ class Held(eqx.Module):
         before = _at_rest(self, scans)
         new = motions.on_host(rows).padded(rounded_up(len(rows)))
         new = _contracted(self, before, new)
-        nodes = place(new, self._num_nodes, averaging, least, scans.count)
+        told = averaging, least, scans.count, None, within
+        nodes = place(new, self._num_nodes, *told)
         placed = _expanded(self, scans.present, before, nodes)
         mode, agrees = map(np.array, _agreeing(motions, placed, least))
         agrees[padding] = False
@@ -122,10 +125,11 @@ class Held(eqx.Module):
         """
         averaging = wide_unless_given(averaging)
         count = jnp.max(jnp.where(scans.present, self.node, 0)) + 1
+        told = averaging, least, count, None, roughly(least)
         for exact in (False, True):
-            motions = measured(scans, placed, least, pairs, exact=exact)
+            motions, log_odds = measured(scans, placed, least, pairs, exact=exact)
             of_nodes = _contracted(self, placed, motions)
-            nodes = place(of_nodes, self._num_nodes, averaging, least, count)
+            nodes = place(of_nodes, self._num_nodes, *told, log_odds if exact else None)
             placed = _expanded(self, scans.present, placed, nodes)
         return placed, AveragedPairs.of(motions, nodes, least)
 

@@ -1,12 +1,7 @@
 """Parts: scans that hang together, each told by the lowest number of its scans."""
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
-
-from jaxreg._core import control
-from jaxreg.graph.joined import in_loops_of_three, joined
-from jaxreg.graph.trees import components
+from jaxtyping import Array, Bool, Int
 
 
 def part_sizes(part: Int[Array, " v"]) -> Int[Array, " v"]:
@@ -47,36 +42,3 @@ def part_numbers(part: Int[Array, " v"], world: Int[Array, ""]) -> Int[Array, " 
     order = jnp.lexsort((ids, -rank))
     number = jnp.zeros_like(part).at[order].set(ids)[part]
     return jnp.where((size > 1) | (number == 0), number, -1).astype(jnp.int32)
-
-
-def confirmed_parts(
-    pairs: Int[Array, "e 2"],
-    weight: Float[Array, " e"],
-    num_scans: int,
-    strong: Bool[Array, " e"],
-) -> Int[Array, " v"]:
-    """Components joined by strong pairs, or by pairs that agree and are confirmed.
-
-    Pairs confirm each other that join the same two parts, or three parts in a loop:
-    that wrong ones agree with the poses by chance is far less likely than any one of
-    them being wrong. What they join is one part from then on.
-    """
-    ones = jnp.ones(len(weight), jnp.int32)
-
-    def merged(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        part, _ = state
-        ends = part[pairs]
-        within = ends[:, 0] == ends[:, 1]
-        present = (weight > 0) & ~within
-        # Pairs that do not count are of no two parts.
-        ends = jnp.where(present[:, None], ends, num_scans - 1)
-        same = joined(ends)
-        twice = jax.ops.segment_sum(ones, same.row, len(ones))[same.row] >= 2
-        loop = in_loops_of_three(ends, present & same.first, num_scans)
-        loop = jax.ops.segment_max(loop.astype(jnp.int32), same.row, len(ones))
-        confirmed = within | twice | (loop[same.row] > 0)
-        new = components(pairs, jnp.where(confirmed, weight, 0), num_scans)
-        return new, jnp.any(new != part)
-
-    core = components(pairs, jnp.where(strong, weight, 0), num_scans)
-    return control.while_loop(lambda s: s[1], merged, (core, jnp.asarray(True)))[0]

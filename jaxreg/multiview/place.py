@@ -5,6 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
@@ -22,7 +23,8 @@ from jaxreg.graph.hang import with_hung
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import components
 from jaxreg.multiview.choose_pairs import most_tries
-from jaxreg.multiview.parts import confirmed_parts, part_numbers, part_sizes
+from jaxreg.multiview.join_parts import confirmed_parts, likeliest_parts
+from jaxreg.multiview.parts import part_numbers, part_sizes
 from jaxreg.multiview.relative_motions import RelativeMotions
 
 
@@ -89,6 +91,8 @@ def place(
     least: Scalar,
     count: Int[Array, ""] | None = None,
     T_start: Float[Array, "v D D"] | None = None,
+    within: Scalar | None = None,
+    log_odds: Float[Array, " e"] | None = None,
 ) -> Placement:
     """Averages the pairs that are likely; the world is the frame of the root.
 
@@ -107,7 +111,9 @@ def place(
     A pair joins scans on its own if its log evidence exceeds `least` by the logarithm
     of `most_tries(v)`: each scan is tried against as many others, so the rate of false
     alarms of one trial is divided by them. Others join parts that a second pair, or a
-    loop of three parts, confirms.
+    loop of three parts, confirms. What averaging trusts in the end is about as exact as
+    the best pairs. Pairs of small overlap err by more, so others that are `within` some
+    distance of the poses may confirm, too.
 
     Args:
         motions: of pairs.
@@ -117,12 +123,18 @@ def place(
         count: how many scans there are, None for all.
         T_start: poses to start from, of parts that hang together by these pairs in a
             frame of each; None to start from the pairs.
+        within: how far from the poses a motion may be that joins parts, in radians and
+            radii; None for those alone that averaging trusts.
+        log_odds: for and against each pair at present poses (`refine.measured`), of all
+            that may overlap: together they must speak for joining parts; None if they
+            are not known.
     """
     num_tries = most_tries(num_scans if count is None else count)
     strong = least + jnp.log(num_tries.astype(least.dtype))
     best = jnp.zeros(len(motions.pairs), jnp.int32)
     alike = jnp.full(len(best), _is_symmetric(motions, least))
-    told = num_scans, averaging, (least, strong), T_start
+    rule = _Joining(least, strong, within, log_odds)
+    told = num_scans, averaging, rule, T_start
     if motions.num_modes == 1:
         return _averaged(motions, best, alike, *told)
 
@@ -144,6 +156,45 @@ def place(
     return found
 
 
+def strictly(like: Scalar) -> Scalar:
+    """`within` of what averaging trusts and no other pair: an array, no program."""
+    return jax.device_put(np.zeros((), like.dtype))
+
+
+def roughly(like: Scalar) -> Scalar:
+    """`within` of pairs that agree, as their modes do."""
+    return jax.device_put(np.asarray(_AGREES, like.dtype))
+
+
+class _Joining(NamedTuple):
+    """Which pairs join scans: log evidence of those that count, and on their own."""
+
+    least: Scalar
+    strong: Scalar
+    within: Scalar | None
+    log_odds: Float[Array, " e"] | None
+
+    def parts(
+        self,
+        pairs: Int[Array, "e 2"],
+        one: RelativeMotions,
+        T_world_i: Float[Array, "v D D"],
+        trusted: Bool[Array, " e"],
+    ) -> Int[Array, " v"]:
+        """Scans that hang together at these poses; averaging trusts some pairs."""
+        log_evidence, num_scans = one.log_evidence[:, 0], T_world_i.shape[0]
+        if self.within is not None:
+            i, j = pairs.T
+            T_i_j = lie.between(T_world_i[i], T_world_i[j])
+            apart = jnp.maximum(*displacement(T_i_j, one.T_i_j[:, 0]))
+            trusted = trusted | (apart < self.within)
+        weight = jnp.where(trusted, prior_weight(one, self.least), 0)
+        joining = pairs, weight, num_scans, log_evidence >= self.strong
+        if self.log_odds is None:
+            return confirmed_parts(*joining)
+        return likeliest_parts(*joining, self.log_odds)
+
+
 class _Pass(NamedTuple):
     """An average by some modes, and the modes that agree with it, where any does."""
 
@@ -160,18 +211,13 @@ def _averaged(
     agrees: Bool[Array, " e"],
     num_scans: int,
     averaging: AbstractAverager | None,
-    told: tuple[Scalar, Scalar],
+    rule: _Joining,
     T_start: Float[Array, "v D D"] | None,
 ) -> Placement:
-    """By one mode of each pair, which others rival unless it agrees with poses.
-
-    `told` is the log evidence of the pairs that count, and of those that join scans on
-    their own.
-    """
-    least, strong = told
+    """By one mode of each pair, which others rival unless it agrees with poses."""
     pairs, one = motions.pairs, motions.of_modes(mode, agrees)
     T_i_j, log_evidence = one.T_i_j[:, 0], one.log_evidence[:, 0]
-    trusted = prior_weight(one, least)
+    trusted = prior_weight(one, rule.least)
     label = components(pairs, trusted, num_scans)
     size = part_sizes(label)
     root = jnp.argmax(size).astype(jnp.int32)
@@ -188,12 +234,11 @@ def _averaged(
         start = lie.between(T_start[label], T_start)[swap]
     solution = average(graph, averaging, start)
     edge_weight = solution.edge_weight[: len(trusted)] * (trusted > 0)
-    agreed = jnp.where(joins(edge_weight), trusted, 0)
-    agreed = jnp.where(solution.placed[swap][pairs].all(axis=1), agreed, 0)
-    part = confirmed_parts(pairs, agreed, num_scans, log_evidence >= strong)
+    T_world_i, placed = solution.T_world_i[swap], solution.placed[swap]
+    agreed = placed[pairs].all(axis=1) & joins(edge_weight)
     return Placement(
-        T_world_i=solution.T_world_i[swap],
-        part=part,
+        T_world_i=T_world_i,
+        part=rule.parts(pairs, one, T_world_i, agreed),
         edge_weight=edge_weight,
         mode=mode,
         status=solution.status,

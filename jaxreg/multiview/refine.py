@@ -23,16 +23,19 @@ from jaxreg.geometry import lie
 from jaxreg.local import GaussNewton, LocalOptimiser
 from jaxreg.matching import Evidence, PlaneToPlane
 from jaxreg.multiview.averaged_pairs import AveragedPairs
+from jaxreg.multiview.choose_pairs import LIKELY
 from jaxreg.multiview.follow_points import follow_points
 from jaxreg.multiview.in_blocks import in_blocks
 from jaxreg.multiview.pair_evidence import pair_evidence
-from jaxreg.multiview.parts import first_where, in_main_body, part_sizes
-from jaxreg.multiview.place import Placement, place
+from jaxreg.multiview.parts import part_sizes
+from jaxreg.multiview.place import Placement, place, roughly
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.robust import GemanMcClure
 
 
+#: Poses that other pairs vouch for need less evidence of their own: odds of e^2.
+VOUCHED = 2.0
 # Kernel widths in sample spacings: first by the voxel tables, then by exact search.
 _TABLE_WIDTHS = (1.4, 1.2, 1.0, 0.8, 0.7, 0.7)
 _EXACT_WIDTHS = (0.7, 0.7, 0.5, 0.5, 0.35, 0.35, 0.35, 0.35)
@@ -69,16 +72,20 @@ def refine(
     averaging = wide_unless_given(averaging)
     moving, scans = scans, lax.stop_gradient(scans)
 
-    def averaged(motions: RelativeMotions, before: Placement) -> Placement:
+    def averaged(
+        motions: RelativeMotions, before: Placement, log_odds: Array | None = None
+    ) -> Placement:
         start = lax.stop_gradient(before.T_world_i) if starts else None
-        return place(motions, scans.num_scans, averaging, least, scans.count, start)
+        told = averaging, least, scans.count, start, roughly(least), log_odds
+        return place(motions, scans.num_scans, *told)
 
-    motions = measured(scans, placement, least, pairs, exact=False)
+    # What these poses say of parts is not asked: they may be a little off.
+    motions, _ = measured(scans, placement, least, pairs, exact=False)
     placement = _updated(placement, averaged(motions, placement))
-    motions = measured(scans, placement, least, pairs, exact=True)
+    motions, log_odds = measured(scans, placement, least, pairs, exact=True)
     told = optimiser_of(motions.T_i_j), _last_width(moving, placement), least
     motions = follow_points(moving, motions, *told)
-    average = averaged(motions, placement)
+    average = averaged(motions, placement, log_odds)
     counted = AveragedPairs.of(motions, average, least)
     return _updated(placement, average), motions, counted
 
@@ -92,13 +99,8 @@ def wide_unless_given(averaging: AbstractAverager | None) -> AbstractAverager:
 
 @kept_program
 def _updated(before: Placement, after: Placement) -> Placement:
-    """The later poses of the scans that both hold, in the earlier frames.
-
-    Of each earlier part, the largest of the later parts in it is held.
-    """
-    ids = jnp.arange(before.part.shape[0], dtype=jnp.int32)
-    held = in_main_body(after.part, before.part) & (part_sizes(before.part) > 1)
-    first = jnp.where(held, first_where(before.part, held), ids)
+    """The later poses: each part where its first scan lay, scans alone as they were."""
+    first, held = after.part, part_sizes(after.part) > 1
     T_before_after = before.T_world_i @ lie.inverse(after.T_world_i)
     T = T_before_after[first] @ after.T_world_i
     T = jnp.where(held[:, None, None], T, before.T_world_i)
@@ -112,15 +114,21 @@ def measured(
     pairs: Int[Array, "p 2"],
     *,
     exact: bool,
-) -> RelativeMotions:
-    """The motion and overlap of pairs of a part near the present poses, m = 1."""
+) -> tuple[RelativeMotions, Float[Array, " p"]]:
+    """Motions and overlaps of pairs near the present poses, and what speaks for these.
 
-    def run(block: Array) -> RelativeMotions:
+    Returns:
+        Of pairs of a part, m = 1; and the log odds that each pair's surfaces coincide
+        at the poses, which others vouch for. They are 0 where surfaces hardly meet: of
+        noise alone some points are near each other by chance.
+    """
+
+    def run(block: Array) -> tuple[RelativeMotions, Array]:
         told = pair_evidence(scans, placement, block)
         return _measured(scans, placement, least, block, told, exact=exact)
 
-    motions = in_blocks(run, pairs, (scans, placement))
-    return eqx.tree_at(lambda m: m.pairs, motions, pairs)
+    motions, log_odds = in_blocks(run, pairs, (scans, placement))
+    return eqx.tree_at(lambda m: m.pairs, motions, pairs), log_odds
 
 
 @kept_program
@@ -132,7 +140,7 @@ def _measured(
     told: Evidence,
     *,
     exact: bool,
-) -> RelativeMotions:
+) -> tuple[RelativeMotions, Float[Array, " b"]]:
     T_world_i = placement.T_world_i
     widths = widths_of(scans, placement, exact=exact)
     optimiser = optimiser_of(T_world_i)
@@ -150,7 +158,8 @@ def _measured(
 
     T_i_j = map_side_by_side(one, (pairs, told.log_evidence), scans.num_rows)
     each = T_i_j, told.overlap, told.log_evidence, told.inlier_rmse
-    return RelativeMotions(pairs, *(x[:, None] for x in each))
+    log_odds = jnp.where(told.fitness >= LIKELY, told.log_evidence + VOUCHED, 0)
+    return RelativeMotions(pairs, *(x[:, None] for x in each)), log_odds
 
 
 def optimiser_of(like: Array) -> LocalOptimiser:

@@ -27,7 +27,7 @@ from jaxreg.multiview.follow_sequence import (
 from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.likely_overlap import LikelyOverlap, NearPairs
 from jaxreg.multiview.method import min_log_evidence, num_kept
-from jaxreg.multiview.place import Placement, joins, likely, place
+from jaxreg.multiview.place import Placement, joins, likely, place, strictly
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
 from jaxreg.multiview.workers import Workers
@@ -234,7 +234,7 @@ class Rounds:
         if self.hold is None:
             placement, trusted = self._placed(found, least)
         else:
-            told = found.padded(self.num_rows), self.averaging, least
+            told = found.padded(self.num_rows), self.averaging, least, strictly(least)
             placement = self.hold.place(self.scans, *told)
             trusted = np.asarray(joins(placement.edge_weight))[: len(found.overlap)]
         near = self.overlaps.of(placement, seed=len(trusted))
@@ -249,7 +249,7 @@ class Rounds:
             rows = np.flatnonzero(np.asarray(likely(found, least)).any(axis=1))
             size = rounded_up(len(rows), an_octave=1)
         motions = found.on_host(rows).padded(size)
-        told = self.averaging, least, self.scans.count
+        told = self.averaging, least, self.scans.count, None, strictly(least)
         placement = place(motions, self.scans.num_scans, *told)
         trusted = np.zeros(len(found.overlap), bool)
         trusted[rows] = np.asarray(joins(placement.edge_weight))[: len(rows)]

@@ -38,7 +38,7 @@ def _found(platform: str, placement: Placement | None = None) -> tuple:
         told = jax.jit(
             lambda scans: (
                 likely_overlap(scans, placed, PAIRS),
-                measured(scans, placed, LEAST, PAIRS, exact=True),
+                measured(scans, placed, LEAST, PAIRS, exact=True)[0],
                 slipping(scans, placed, LEAST, PAIRS),
             )
         )(scans)

@@ -8,7 +8,7 @@ from helpers import motion, pose_error
 from jaxreg import MCC, SpanningTree
 from jaxreg.multiview import RelativeMotions
 from jaxreg.multiview.choose_pairs import all_pairs
-from jaxreg.multiview.place import Placement, place
+from jaxreg.multiview.place import Placement, place, roughly, strictly
 
 
 T_TRUE = np.stack([motion(k, 3) for k in range(7)]).astype(np.float32)
@@ -169,3 +169,42 @@ def test_poses_to_start_from_decide_where_a_tree_would_lead_astray():
         angle, shift = pose_error(np.linalg.inv(T_found[i]) @ T_found[j], T_true)
         assert angle < 1e-3
         assert shift < 1e-3
+
+
+def _scan_held_roughly() -> RelativeMotions:
+    """Scan 5 by three pairs that err by a hundredth, others by a ten-thousandth."""
+    ids = np.concatenate([all_pairs(5), [[0, 5], [1, 5], [2, 5]]])
+    T_i_j = np.linalg.inv(T_TRUE[ids[:, 0]]) @ T_TRUE[ids[:, 1]]
+    rough = np.arange(len(ids)) >= 10
+    for k, T in enumerate(T_i_j):
+        T[:3, 3] += np.random.default_rng(k).normal(size=3) * (
+            1e-2 if rough[k] else 1e-4
+        )
+    told = np.where(rough, 2.0, 6.0)[:, None]
+    share = np.full((len(ids), 1), 0.4)
+    floats = (x.astype(np.float32) for x in (T_i_j[:, None], share, told, share))
+    return RelativeMotions(*map(jnp.asarray, (ids.astype(np.int32), *floats)))
+
+
+def test_pairs_that_err_more_than_others_join_a_scan_where_they_agree():
+    motions = _scan_held_roughly().padded(NUM * (NUM - 1) // 2)
+    for within, last in ((strictly(LEAST), 5), (roughly(LEAST), 0)):
+        found = place(motions, NUM, None, LEAST, None, None, within)
+        np.testing.assert_array_equal(found.part, [0] * 5 + [last] + _alone(6))
+
+
+def test_what_speaks_against_a_part_keeps_it_apart():
+    """Both pairs of scan 3 agree; one with scan 2, which must meet it, does not."""
+    ids = np.array([[0, 1], [0, 2], [1, 2], [0, 3], [1, 3], [2, 3]], np.int32)
+    T_i_j = (np.linalg.inv(T_TRUE[ids[:, 0]]) @ T_TRUE[ids[:, 1]])[:, None]
+    told = np.array([5, 5, 5, 1.5, 1.5, -9], np.float32)
+    share = np.full((6, 1), 0.4, np.float32)
+    each = ids, T_i_j.astype(np.float32), share, told[:, None], share
+    motions = RelativeMotions(*map(jnp.asarray, each)).padded(NUM * (NUM - 1) // 2)
+    odds = np.zeros(NUM * (NUM - 1) // 2, np.float32)
+    for against, last in ((-0.5, 0), (-9.0, 3)):
+        odds[:6] = [4, 4, 4, 0.5, 0.5, against]
+        method, within = MCC(initialiser=SpanningTree()), roughly(LEAST)
+        told = method, LEAST, None, None, within, jnp.asarray(odds)
+        found = place(motions, NUM, *told)
+        np.testing.assert_array_equal(found.part, [0, 0, 0, last] + _alone(4))
