@@ -5,7 +5,7 @@
 
 HOST:PORT is where the first listens. Each host makes (or reads) the same pairs,
 registers those that its devices hold, and prints them; nothing is exchanged but the
-addresses of devices.
+addresses of devices. Where one does not come the others end after a minute.
 """
 
 import sys
@@ -23,6 +23,11 @@ SECONDS = 60  # to wait for a host that does not come
 
 def main(coordinator: str, num_hosts: int, host: int) -> None:
     """Registers pairs of one model, each turned about another angle."""
+    # JAX ends the process where they do not come, and does not say who was missing.
+    print(  # noqa: T201
+        f"host {host} waits {SECONDS} s at most for {num_hosts} hosts at {coordinator}",
+        flush=True,
+    )
     jax.distributed.initialize(
         coordinator, num_hosts, host, initialization_timeout=SECONDS
     )

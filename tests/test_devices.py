@@ -168,9 +168,8 @@ def test_a_mesh_is_named_as_it_should_be(batch, clouds):
         chosen_devices(2)
 
 
-def test_two_hosts_share_the_pairs():
-    """`notebooks/hosts.py`, as its text says."""
-    root = Path(__file__).parents[1]
+def _hosts(command: list[str], num: int) -> list[subprocess.Popen]:
+    """So many of the hosts that share the work; the command ends in an address."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
@@ -178,16 +177,22 @@ def test_two_hosts_share_the_pairs():
     count = "--xla_force_host_platform_device_count="
     flags = re.sub(count + r"\d+", count + "2", os.environ["XLA_FLAGS"])
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
-    hosts = [
+    return [
         subprocess.Popen(
-            [sys.executable, "notebooks/hosts.py", address, "2", str(k)],
-            cwd=root,
+            [sys.executable, *command, address, "2", str(k)],
+            cwd=Path(__file__).parents[1],
             env=environment,
             stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
             text=True,
         )
-        for k in range(2)
+        for k in range(num)
     ]
+
+
+def test_two_hosts_share_the_pairs():
+    """`notebooks/hosts.py`, as its text says."""
+    hosts = _hosts(["notebooks/hosts.py"], 2)
     try:
         told = [host.communicate(timeout=300)[0].splitlines() for host in hosts]
     finally:
@@ -200,3 +205,17 @@ def test_two_hosts_share_the_pairs():
         assert pairs == list(range(4 * k, 4 * k + 4))
         found = [float(x.split()[4]) for x in rows]
         np.testing.assert_allclose(found, angles[pairs], atol=2e-3)
+
+
+def test_a_host_waits_for_others_no_longer_than_it_says():
+    short = (
+        "import sys; sys.path.append('notebooks'); import hosts; hosts.SECONDS = 1; "
+    )
+    (host,) = _hosts(["-c", short + "hosts.main(sys.argv[1], 2, 0)"], 1)
+    try:
+        told, _ = host.communicate(timeout=60)
+    finally:
+        host.kill()
+    assert host.returncode
+    assert "host 0 waits 1 s at most for 2 hosts at localhost:" in told
+    assert "DEADLINE_EXCEEDED" in told

@@ -36,7 +36,7 @@ def check_executor(executor: object) -> None:
 
 
 class WorkerError(RuntimeError):
-    """A worker of other versions, or one that does not see the caller's files."""
+    """A worker without this package, of other versions, or that sees no files."""
 
 
 class _Task(NamedTuple):
@@ -111,7 +111,13 @@ class Workers:
         finally:
             _cancel(waiting)
         if failed is not None:
-            raise failed
+            missing = _missing_module(failed)
+            if missing is None:
+                raise failed
+            raise WorkerError(
+                f"The scheduler or a worker has no {missing}: install there what the "
+                f"caller has, {', '.join(_versions())}."
+            ) from failed
 
     def _task(self, pairs: np.ndarray) -> _Task:
         config: Any = jax.config  # its names are made as it runs
@@ -128,6 +134,15 @@ class Workers:
 def _cancel(waiting: Iterable[Future[RelativeMotions]]) -> None:
     for future in waiting:
         future.cancel()
+
+
+def _missing_module(error: BaseException | None) -> str | None:
+    """What could not be imported elsewhere, if that is why something failed."""
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError):
+            return error.name or str(error)
+        error = error.__cause__ or error.__context__
+    return None
 
 
 @functools.cache

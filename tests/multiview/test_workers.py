@@ -44,14 +44,14 @@ def alone():
 class _Here(Executor):
     """Calls what is submitted, at once; from the second on it fails, if it is to."""
 
-    def __init__(self, fails: bool = False) -> None:
-        self.tasks, self.fails = [], fails
+    def __init__(self, error: Exception | None = None) -> None:
+        self.tasks, self.error = [], error
 
     def submit(self, fn, /, *args, **kwargs):
         self.tasks.append(args[0])
         future: Future = Future()
-        if self.fails and len(self.tasks) > 1:
-            future.set_exception(RuntimeError("out of order"))
+        if self.error is not None and len(self.tasks) > 1:
+            future.set_exception(self.error)
         else:
             future.set_result(fn(*args, **kwargs))
         return future
@@ -69,7 +69,7 @@ def test_processes_give_the_very_bits(alone):
 
 
 def test_what_was_found_before_a_failure_leads_to_the_same_answer(alone):
-    here, pairs = _Here(fails=True), []
+    here, pairs = _Here(RuntimeError("out of order")), []
     with pytest.raises(RuntimeError, match="out of order"):
         jr.reconstruct(
             SCANS,
@@ -108,6 +108,15 @@ def test_workers_of_another_version_or_without_the_files_are_refused():
     with pytest.raises(RuntimeError, match="does not see .*TMPDIR"):
         workers._registered(task)
     assert not list(Path(tempfile.gettempdir()).glob(f"{task.shared.parent.name}*"))
+
+
+def test_workers_without_the_package_are_refused_by_its_name():
+    """As Dask tells it."""
+    error = RuntimeError("Error during deserialization of the task graph.")
+    error.__cause__ = ModuleNotFoundError("No module named 'jaxreg'", name="jaxreg")
+    here = f"jaxreg {jr.__version__}, jax {jax.__version__}"
+    with pytest.raises(workers.WorkerError, match=f"has no jaxreg: .* has, {here}"):
+        _solved(executor=_Here(error))
 
 
 def test_an_executor_is_wanted_and_not_under_jit():
