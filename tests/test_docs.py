@@ -17,7 +17,7 @@ import jaxreg as jr
 from jaxreg.cloud import OTHER_UNIT
 from jaxreg.correlation import ascent
 from jaxreg.local import curvature
-from jaxreg.multiview import place
+from jaxreg.multiview import which_join
 from jaxreg.particle import conclude
 
 
@@ -27,7 +27,7 @@ THRESHOLDS = {
     jr.Status.DEGENERATE: (curvature._DEGENERATE, ascent._FREE),
     jr.Status.LOW_OVERLAP: (float(jnp.asarray(jr.ParticleFilter().min_log_evidence)),),
     jr.Status.AMBIGUOUS: (conclude.LEAST_ODDS,),
-    jr.Status.DISCONNECTED: (place._MIN_TRUST,),
+    jr.Status.DISCONNECTED: (which_join._MIN_TRUST,),
     jr.Status.UNIT_DIFFERS: (OTHER_UNIT,),
 }
 

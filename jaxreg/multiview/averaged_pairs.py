@@ -8,8 +8,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
-from jaxreg.multiview.place import Placement, prior_weight
+from jaxreg.multiview.place import Placement
 from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.which_join import prior_weight
 
 
 class AveragedPairs(eqx.Module):

@@ -20,11 +20,12 @@ from jaxreg.multiview.likely_overlap import LikelyOverlap
 from jaxreg.multiview.method import min_log_evidence
 from jaxreg.multiview.near_pairs import near_pairs
 from jaxreg.multiview.pair_trust import pair_trust
-from jaxreg.multiview.place import Placement, agreeing, place, prior_weight, roughly
+from jaxreg.multiview.place import Placement, agreeing, place
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import VOUCHED, refine
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution
+from jaxreg.multiview.which_join import prior_weight, roughly
 from jaxreg.registrar import AbstractRegistrar
 
 

@@ -10,8 +10,9 @@ from jaxtyping import Array, Bool
 from jaxreg._core.programs import kept_program
 from jaxreg.graph.trees import components
 from jaxreg.multiview.parts import in_main_body
-from jaxreg.multiview.place import Placement, joins
+from jaxreg.multiview.place import Placement
 from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.which_join import joins
 
 
 # Modes that a symmetry makes equal differ in log evidence by 0.25 at most, in 108 pairs

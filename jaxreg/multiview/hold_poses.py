@@ -18,12 +18,13 @@ from jaxreg.batching.padding import rounded_up
 from jaxreg.geometry import lie
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.multiview.averaged_pairs import AveragedPairs
-from jaxreg.multiview.place import Placement, agreeing, place, roughly
+from jaxreg.multiview.place import Placement, agreeing, place
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.refine import measured, wide_unless_given
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.scan_blocks import rows_for
 from jaxreg.multiview.solution import ReconstructionSolution
+from jaxreg.multiview.which_join import roughly
 
 
 class Held(eqx.Module):

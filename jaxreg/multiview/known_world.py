@@ -27,10 +27,11 @@ from jaxreg.geometry import lie
 from jaxreg.graph import PoseGraph
 from jaxreg.linear.small import product
 from jaxreg.multiview.pair_trust import pair_trust
-from jaxreg.multiview.place import Placement, joins, prior_weight
+from jaxreg.multiview.place import Placement
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
 from jaxreg.multiview.solution import ReconstructionSolution
+from jaxreg.multiview.which_join import joins, prior_weight
 
 
 class KnownWorld(eqx.Module):

@@ -13,9 +13,10 @@ from jaxreg._core.programs import kept_program
 from jaxreg.graph.joined import joined
 from jaxreg.multiview.choose_pairs import ALL_UP_TO, LIKELY, all_pairs
 from jaxreg.multiview.likely_overlap import LikelyOverlap, NearPairs, likely_overlap
-from jaxreg.multiview.place import Placement, joins
+from jaxreg.multiview.place import Placement
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.which_join import joins
 
 
 # Partners of a scan beside those that placed it, drawn among those that overlap it: the

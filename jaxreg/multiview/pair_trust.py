@@ -4,9 +4,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxreg.geometry import lie
-from jaxreg.multiview.place import Placement, displacement
+from jaxreg.multiview.place import Placement
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.which_join import displacement
 
 
 def pair_trust(

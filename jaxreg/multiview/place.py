@@ -5,7 +5,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
@@ -23,25 +22,24 @@ from jaxreg.graph.hang import with_hung
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import components
 from jaxreg.multiview.choose_pairs import most_tries
-from jaxreg.multiview.join_parts import confirmed_parts, likeliest_parts
 from jaxreg.multiview.parts import part_numbers, part_sizes
 from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.which_join import (
+    AGREES,
+    Joining,
+    displacement,
+    joins,
+    likely,
+    prior_weight,
+)
 
 
-# An edge whose residual leaves it less trust than this joins no scans.
-_MIN_TRUST = 0.1
-# A mode agrees with poses within this, in radians and radii: half of what two modes of
-# a pair are apart.
-_AGREES = 0.15
 # Averages at most: of the best modes, then of those that agree with the poses from
 # these, where these are others.
 _PASSES = 2
 # Of something symmetric at most one likely pair of so many is clear: of cubes none, of
 # views of rooms two in five, of scans of objects nearly all.
 _SYMMETRIC = 10
-# Pairs that `register` would not believe may count where others confirm them: those
-# whose log evidence is at most so much below.
-_CONFIRMABLE = 1.0
 
 
 class Placement(eqx.Module):
@@ -133,7 +131,7 @@ def place(
     strong = least + jnp.log(num_tries.astype(least.dtype))
     best = jnp.zeros(len(motions.pairs), jnp.int32)
     alike = jnp.full(len(best), _is_symmetric(motions, least))
-    rule = _Joining(least, strong, within, log_odds)
+    rule = Joining(least, strong, within, log_odds)
     told = num_scans, averaging, rule, T_start
     if motions.num_modes == 1:
         return _averaged(motions, best, alike, *told)
@@ -156,45 +154,6 @@ def place(
     return found
 
 
-def strictly(like: Scalar) -> Scalar:
-    """`within` of what averaging trusts and no other pair: an array, no program."""
-    return jax.device_put(np.zeros((), like.dtype))
-
-
-def roughly(like: Scalar) -> Scalar:
-    """`within` of pairs that agree, as their modes do."""
-    return jax.device_put(np.asarray(_AGREES, like.dtype))
-
-
-class _Joining(NamedTuple):
-    """Which pairs join scans: log evidence of those that count, and on their own."""
-
-    least: Scalar
-    strong: Scalar
-    within: Scalar | None
-    log_odds: Float[Array, " e"] | None
-
-    def parts(
-        self,
-        pairs: Int[Array, "e 2"],
-        one: RelativeMotions,
-        T_world_i: Float[Array, "v D D"],
-        trusted: Bool[Array, " e"],
-    ) -> Int[Array, " v"]:
-        """Scans that hang together at these poses; averaging trusts some pairs."""
-        log_evidence, num_scans = one.log_evidence[:, 0], T_world_i.shape[0]
-        if self.within is not None:
-            i, j = pairs.T
-            T_i_j = lie.between(T_world_i[i], T_world_i[j])
-            apart = jnp.maximum(*displacement(T_i_j, one.T_i_j[:, 0]))
-            trusted = trusted | (apart < self.within)
-        weight = jnp.where(trusted, prior_weight(one, self.least), 0)
-        joining = pairs, weight, num_scans, log_evidence >= self.strong
-        if self.log_odds is None:
-            return confirmed_parts(*joining)
-        return likeliest_parts(*joining, self.log_odds)
-
-
 class _Pass(NamedTuple):
     """An average by some modes, and the modes that agree with it, where any does."""
 
@@ -211,7 +170,7 @@ def _averaged(
     agrees: Bool[Array, " e"],
     num_scans: int,
     averaging: AbstractAverager | None,
-    rule: _Joining,
+    rule: Joining,
     T_start: Float[Array, "v D D"] | None,
 ) -> Placement:
     """By one mode of each pair, which others rival unless it agrees with poses."""
@@ -279,34 +238,6 @@ def agreeing(
     i, j = motions.pairs.T
     T_i_j = lie.between(found.T_world_i[i], found.T_world_i[j])
     turn, shift = displacement(T_i_j[:, None], motions.T_i_j)
-    agrees = (turn < _AGREES) & (shift < _AGREES) & likely(motions, least)
+    agrees = (turn < AGREES) & (shift < AGREES) & likely(motions, least)
     agrees = agrees & found.together(i, j)[:, None]
     return jnp.argmax(agrees, axis=1).astype(jnp.int32), jnp.any(agrees, axis=1)
-
-
-def displacement(
-    T_a_b: Float[Array, "... D D"], T_other: Float[Array, "... D D"]
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """How far two motions take a centred scan apart: angle, distance of its centre."""
-    R = jnp.einsum("...ij,...kj->...ik", lie.rotation(T_a_b), lie.rotation(T_other))
-    shift = lie.translation(T_a_b) - lie.translation(T_other)
-    return lie.rotation_angle(R), jnp.sqrt(jnp.sum(shift**2, axis=-1))
-
-
-def likely(motions: RelativeMotions, least: Scalar) -> Bool[Array, "e m"]:
-    """Which modes count where others confirm them."""
-    return motions.log_evidence >= least - _CONFIRMABLE
-
-
-def prior_weight(one: RelativeMotions, least: Scalar) -> Float[Array, " e"]:
-    """Of pairs of one mode: overlap times probability, zero of those not likely.
-
-    The larger the overlap, the more accurate the motion.
-    """
-    weight = one.overlap * jax.nn.sigmoid(one.log_evidence)
-    return jnp.where(likely(one, least), weight, 0)[:, 0]
-
-
-def joins(edge_weight: Float[Array, " e"]) -> Bool[Array, " e"]:
-    """Which pairs join scans, by the trust that averaging leaves them."""
-    return edge_weight > _MIN_TRUST

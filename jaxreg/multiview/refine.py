@@ -28,9 +28,10 @@ from jaxreg.multiview.follow_points import follow_points
 from jaxreg.multiview.in_blocks import in_blocks
 from jaxreg.multiview.pair_evidence import pair_evidence
 from jaxreg.multiview.parts import part_sizes
-from jaxreg.multiview.place import Placement, place, roughly
+from jaxreg.multiview.place import Placement, place
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions
+from jaxreg.multiview.which_join import roughly
 from jaxreg.robust import GemanMcClure
 
 

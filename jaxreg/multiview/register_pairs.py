@@ -27,9 +27,10 @@ from jaxreg.multiview.follow_sequence import (
 from jaxreg.multiview.hold_poses import Held
 from jaxreg.multiview.likely_overlap import LikelyOverlap, NearPairs
 from jaxreg.multiview.method import min_log_evidence, num_kept
-from jaxreg.multiview.place import Placement, joins, likely, place, strictly
+from jaxreg.multiview.place import Placement, place
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.relative_motions import RelativeMotions, relative_motions
+from jaxreg.multiview.which_join import joins, likely, strictly
 from jaxreg.multiview.workers import Workers
 from jaxreg.registrar import AbstractRegistrar
 

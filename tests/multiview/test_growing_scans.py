@@ -20,10 +20,11 @@ from jaxreg.multiview import (
     prepare_in_blocks,
     relative_motions,
     scan_blocks,
+    which_join,
 )
 from jaxreg.multiview.hold_poses import Held
-from jaxreg.multiview.place import displacement
 from jaxreg.multiview.prepared_scans import PreparedScans
+from jaxreg.multiview.which_join import displacement, joins
 
 
 def _solved(num: int, **told: Any) -> jr.ReconstructionSolution:
@@ -57,7 +58,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What is traced of the two programs that take longest to compile."""
     jax.clear_caches()
     names: list[str] = []
-    for module, name in ((relative_motions, "solve"), (place, "confirmed_parts")):
+    for module, name in ((relative_motions, "solve"), (which_join, "confirmed_parts")):
         watched = partial(_watched, names, name, getattr(module, name))
         monkeypatch.setattr(module, name, watched)
     return names
@@ -148,7 +149,7 @@ def test_in_a_round_pairs_of_two_that_stay_count_as_their_poses_have_them():
     hold = Held.of(_solved(4), scans)
     told = found.padded(16), jr.SpanningTree(), jnp.zeros(())
     placed = hold.place(scans, *told)
-    trusted = np.asarray(place.joins(placed.edge_weight))
+    trusted = np.asarray(joins(placed.edge_weight))
     assert not np.any(trusted[len(ids) :])
     told = dict(zip(map(tuple, ids), trusted.tolist(), strict=False))
     assert not told[0, 1]

@@ -8,7 +8,8 @@ from helpers import motion, pose_error
 from jaxreg import MCC, SpanningTree
 from jaxreg.multiview import RelativeMotions
 from jaxreg.multiview.choose_pairs import all_pairs
-from jaxreg.multiview.place import Placement, place, roughly, strictly
+from jaxreg.multiview.place import Placement, place
+from jaxreg.multiview.which_join import roughly, strictly
 
 
 T_TRUE = np.stack([motion(k, 3) for k in range(7)]).astype(np.float32)
