@@ -51,8 +51,8 @@ def likeliest_parts(
 
     Where rooms are alike, or their walls meet at right angles, several wrong pairs may
     agree. But then scans meet that share no surface, and say so. So two parts join
-    where more speaks for it than against it, and more than for joining either to any
-    other; and so on, with what is joined by then.
+    where more speaks for it than against it, and about as much as for joining either to
+    any other; and so on, with what is joined by then.
 
     Args:
         pairs: scans i and j.
@@ -71,15 +71,35 @@ def likeliest_parts(
         present, told = agrees & across, (agrees | (log_odds != 0)) & across
         ends = _ends(pairs, part, told, num_scans)
         same = joined(ends)
+        total = _total(jnp.where(told, log_odds, 0), same)
         able = _total(present & strong, same) > 0
         able = told & (able | _confirmed(ends, same, present, num_scans))
-        total = jnp.where(able, _total(jnp.where(told, log_odds, 0), same), 0)
-        best = jnp.zeros(num_scans, total.dtype).at[ends].max(total[:, None])
-        join = (total > 0) & jnp.all(total[:, None] >= best[ends], axis=1)
-        return _joined(part, ends, join)
+        return _joined(part, ends, _best_joins(ends, total, told, able, num_scans))
 
     alone = jnp.arange(num_scans, dtype=jnp.int32)
     return control.while_loop(lambda s: s[1], merged, (alone, jnp.asarray(True)))[0]
+
+
+def _best_joins(
+    ends: Int[Array, "e 2"],
+    total: Float[Array, " e"],
+    told: Bool[Array, " e"],
+    able: Bool[Array, " e"],
+    num_scans: int,
+) -> Bool[Array, " e"]:
+    """Pairs between parts that are each other's best.
+
+    To take few rounds, also those that are half as good, unless they would bring parts
+    together in this round that speak more against each other.
+    """
+    none, support = jnp.zeros(num_scans, total.dtype), jnp.where(able, total, 0)
+    best = none.at[ends].max(support[:, None])[ends]
+    mutual = (support > 0) & jnp.all(support[:, None] >= best, axis=1)
+    good = (support > 0) & jnp.all(2 * support[:, None] >= best, axis=1)
+    would = components(ends, good.astype(jnp.float32), num_scans)[ends]
+    meets = told & (would[:, 0] == would[:, 1])
+    against = none.at[ends].max(jnp.where(meets, -total, 0)[:, None])[ends]
+    return mutual | (good & jnp.all(support[:, None] > against, axis=1))
 
 
 def _across(pairs: Int[Array, "e 2"], part: Int[Array, " v"]) -> Bool[Array, " e"]:

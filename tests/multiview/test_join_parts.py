@@ -69,18 +69,27 @@ def test_pairs_that_confirm_each_other_join(told: list):
     np.testing.assert_array_equal(_CONFIRMED(*_arrays(told)[:4]), part)
 
 
-@settings(max_examples=100, deadline=None)
+def _best_joins(total: dict, able: set) -> list[tuple[int, int]]:
+    """Each other's best, and those half as good that bring nothing worse along."""
+    support = {k: total[k] for k in able if total[k] > 0}
+    best = [max([x for k, x in support.items() if p in k] + [0]) for p in range(NUM)]
+    mutual = [k for k, x in support.items() if x == best[k[0]] == best[k[1]]]
+    good = [k for k, x in support.items() if 2 * x >= max(best[k[0]], best[k[1]])]
+    would = _merged(list(range(NUM)), good)
+    meets = {k: -x for k, x in total.items() if would[k[0]] == would[k[1]]}
+    against = [max([x for k, x in meets.items() if p in k] + [0]) for p in range(NUM)]
+    quiet = [k for k in good if support[k] > max(against[k[0]], against[k[1]])]
+    return sorted({*mutual, *quiet})
+
+
+@settings(max_examples=200, deadline=None)
 @given(told=_PAIRS)
 def test_parts_join_where_most_speaks_for_it_of_either(told: list):
     part = list(range(NUM))
     while True:
         between = _between(told, part)
-        total = {k: sum(x[2] for x in between[k]) for k in _able(between)}
-        total = {k: x for k, x in total.items() if x > 0}
-        best = {
-            p: max((x for k, x in total.items() if p in k), default=0) for p in part
-        }
-        joins = [k for k, x in total.items() if x == best[k[0]] == best[k[1]]]
+        total = {k: sum(x[2] for x in rest) for k, rest in between.items()}
+        joins = _best_joins(total, _able(between))
         if not joins:
             break
         part = _merged(part, joins)
