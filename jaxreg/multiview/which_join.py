@@ -62,7 +62,12 @@ def roughly(like: Scalar) -> Scalar:
 
 
 class Joining(NamedTuple):
-    """Which pairs join scans: log evidence of those that count, and on their own."""
+    """Which pairs join scans.
+
+    Attributes:
+        least, strong: log evidence of the pairs that count, and that join on their own.
+        within, log_odds: see `place`.
+    """
 
     least: Scalar
     strong: Scalar

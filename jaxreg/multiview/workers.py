@@ -141,7 +141,7 @@ def _missing_module(error: BaseException | None) -> str | None:
     while error is not None:
         if isinstance(error, ModuleNotFoundError):
             return error.name or str(error)
-        error = error.__cause__ or error.__context__
+        error = error.__cause__
     return None
 
 
