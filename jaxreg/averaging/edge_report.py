@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
 
 from jaxreg._core.arrays import widened
 from jaxreg._core.checks import check_count
+from jaxreg._core.chi_squared import probability_above
 from jaxreg._core.programs import kept_program
 from jaxreg.averaging.base import AveragingSolution
 from jaxreg.averaging.measures import deviations
@@ -153,9 +153,7 @@ def edge_report(
         chi_square=total,
         degrees_of_freedom=spare,
         variance_factor=total / spare if spare > 0 else float("nan"),
-        p_value=float(scipy.special.chdtrc(spare, total))
-        if spare > 0
-        else float("nan"),
+        p_value=probability_above(total, spare) if spare > 0 else float("nan"),
         prior_noise=prior_noise,
         worst=order[: min(10, int(trusted.sum()))],
     )

@@ -49,11 +49,12 @@ def command() -> NoReturn:
     code = main()
     if code == _INTERRUPTED:
         code = 128 + ended[0] if ended else code
-        # Threads may still compute, and crash as Python takes down what they use.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    sys.exit(code)
+    # All is written. To take down JAX and its programs takes half a second, and threads
+    # that still compute after an interruption crash as Python takes down what they use.
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):  # nobody reads any more
+            stream.flush()
+    os._exit(code)
 
 
 def _heard_again(lost: "sys.UnraisableHookArgs") -> None:

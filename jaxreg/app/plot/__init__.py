@@ -1,7 +1,7 @@
 """Pictures and pages of results; needs the extra `app`."""
 
-from jaxreg.app.plot.figure import draw_reconstruction as draw_reconstruction
-from jaxreg.app.plot.figure import save_figure as save_figure
-from jaxreg.app.plot.graph import draw_graph as draw_graph
-from jaxreg.app.plot.report import write_report as write_report
-from jaxreg.app.plot.report_graph import write_graph_report as write_graph_report
+import lazy_loader
+
+
+# Names are in the stub beside this file: a page of scans needs no averaging.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -31,6 +31,7 @@ def result_of(
         scan_status = np.array([Status.CONVERGED, status])
         edges, T_i_j, keep = np.array([[0, 1]]), T[None], slice(None)
         weight = np.array([float(found)])
+        labels = ["target", "source"]
     else:
         poses = np.asarray(solution.T_world_i, np.float64)
         component = np.asarray(solution.component)
@@ -39,8 +40,6 @@ def result_of(
         edges = np.asarray(solution.graph.edges)[keep]
         T_i_j = np.asarray(solution.graph.T_i_j, np.float64)[keep]
         weight = np.asarray(solution.edge_weight)[keep]
-    labels = ["target", "source"]
-    if isinstance(solution, jaxreg.ReconstructionSolution):
         labels = [f"scan {k}" for k in range(len(poses))]
     return Result(
         names=labels if names is None else list(names),

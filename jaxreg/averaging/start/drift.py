@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import scipy.special
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxreg._core import control
+from jaxreg._core.chi_squared import exceeded_with
 from jaxreg._core.quantile import nearest_rank
 from jaxreg.averaging.steps.gauss_newton import precisions
 from jaxreg.averaging.steps.kernel_width import chi2_median
@@ -75,7 +75,7 @@ def drifted(graph: PoseGraph, closure: Bool[Array, " e"]) -> Bool[Array, " e"]:
     known = known & closure
     k = lie.tangent_dim(graph.dim)
     usual = nearest_rank(square, known, 0.5) / chi2_median(k)
-    off = known & (square > usual * float(scipy.special.chdtri(k, _REFUSED)))
+    off = known & (square > usual * exceeded_with(_REFUSED, k))
     low, high = jnp.min(graph.edges, axis=1), jnp.max(graph.edges, axis=1)
     in_question = (_over(graph, off) > _FEW) & (_over(graph, known & ~off) == 0)
     before = jnp.cumsum(in_question) - in_question

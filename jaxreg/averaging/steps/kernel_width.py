@@ -3,9 +3,9 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import scipy.special
 from jaxtyping import Array, Bool, Float
 
+from jaxreg._core.chi_squared import exceeded_with
 from jaxreg._core.quantile import nearest_rank
 from jaxreg.averaging.likelihood import Likelihood
 from jaxreg.averaging.steps.iterate import STILL, WidthOf
@@ -148,7 +148,7 @@ def middle_variances(
 
 def chi2_median(dof: int) -> float:
     """Of the chi-squared law: the middle square of noise of variance one."""
-    return float(scipy.special.chdtri(dof, 0.5))
+    return exceeded_with(0.5, dof)
 
 
 def spared_variances(
