@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxreg
 from bench.motion_scans import SETS, load_scans
+from bench.room_views import kitchen
 from bench.workloads.sensor_data import sequences
 
 
@@ -156,6 +157,8 @@ def real(name: str, data: Path, key: int = 0) -> Iterator[CoveragePair]:
 
 
 def _scans(name: str, data: Path) -> list[np.ndarray]:
+    if name == "kitchen":
+        return kitchen(data / "kitchen_fragments")[0]
     if name in SETS:
         return load_scans(name, data)[1]
     return next(x.scans for x in sequences(data) if x.name == name)

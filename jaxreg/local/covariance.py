@@ -12,9 +12,11 @@ from jaxreg._core.arrays import full_matmul, place_among
 from jaxreg._core.typing import Motion
 from jaxreg.local.answer import answer_of, displaced, reach_of, some_points
 from jaxreg.local.held_directions import inverse_of, whitening
+from jaxreg.local.leverage import share_left
 from jaxreg.local.optimiser import LocalOptimiser
 from jaxreg.local.steps import turn_and_shift
 from jaxreg.matching.problem import Match, Problem, match
+from jaxreg.matching.residuals.gram import along
 from jaxreg.neighbours.brute import BruteForce
 
 
@@ -51,8 +53,8 @@ def pose_covariance(
       overlap all err to one side. So terms are summed over cells of some target points
       before they are squared (Liang and Zeger 1986). Real scans are warped, too, and
       err alike over wider parts: B is raised by how much larger, in the mean over its
-      axes, it is of sums over patches of cells. Nothing is assumed about the size of
-      the errors.
+      axes, it is of sums over patches of cells, each for the share of the pose that it
+      decides alone. Nothing is assumed about the size of the errors.
     * A is minus the derivative of the sum, with the closest points found anew and
       weighed anew: those that noise brought near answer less to a motion than H, which
       holds matches and weights, says (a fifth as much at a noise of 0.4 sample
@@ -120,7 +122,9 @@ def pose_covariance(
     start = _Sums(zero, zero, zero), zero
     (_, there, here), inverse = control.fori_loop(0, 1 + _AROUND, around, start)
     # Of all points as much as of those that were asked, in deviations of the pose.
-    asked, shared = jnp.sum(here * inverse) / _AROUND, _shared(at_root, patch, inverse)
+    asked = jnp.sum(here * inverse) / _AROUND
+    rows = along(found.normal, found)[:-1]
+    shared = _shared(at_root, patch, inverse, (rows, weight, cell[found.row]))
     growth = shared / jnp.where(asked > 0, asked, 1)
     return full_matmul(inverse, full_matmul(growth / _AROUND * there, inverse))
 
@@ -171,15 +175,27 @@ def _scatter(pulls: Float[Array, "c k"]) -> Float[Array, "k k"]:
 
 
 def _shared(
-    at_root: Float[Array, "c k"], patch: Int[Array, " c"], inverse: Float[Array, "k k"]
+    at_root: Float[Array, "c k"],
+    patch: Int[Array, " c"],
+    inverse: Float[Array, "k k"],
+    points: tuple[Float[Array, "k n"], Float[Array, " n"], Int[Array, " n"]],
 ) -> Float[Array, ""]:
     """B of the cells in the mean over its axes, or of patches where that is larger.
 
-    Patches sum to zero at the root, so one of them tells nothing.
+    What a patch decides alone does not show in its pull, see `share_left`.
+
+    Args:
+        at_root: pulls of the cells.
+        patch: of each cell.
+        inverse: A^-1.
+        points: rows (n, x cross n) of the source points, their weights and cells.
     """
+    rows, weight, cell = points
     wide = jax.ops.segment_sum(at_root, patch, _PATCHES)
-    own, wide = (jnp.sum(_scatter(x) * inverse) for x in (at_root, wide))
-    return jnp.maximum(own, _PATCHES / (_PATCHES - 1) * wide)
+    led = full_matmul(wide, inverse)
+    left = share_left(led, rows, weight, patch[cell])
+    cells = jnp.sum(_scatter(at_root) * inverse)
+    return jnp.maximum(cells, jnp.sum(wide * led / left[:, None]))
 
 
 def _cells(problem: Problem) -> tuple[Int[Array, " m"], Int[Array, " c"]]:

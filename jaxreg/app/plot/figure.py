@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -101,13 +102,17 @@ def _draw_solid(
     model_colors = colors[keep]
     axes_of_model, centre = principal_axes(np.concatenate(model))
     camera = tilt(20.0, 25.0) @ axes_of_model
+    views = {1: ([(x - centre) @ camera.T for x in model], model_colors)}
+    axes[1].set_title("after: one frame")
     if first:
         # The first panel sees the frames as they came, about their common middle.
         middle = np.median(np.concatenate(before), axis=0)
-        _show(axes[0], [(x - middle) @ camera.T for x in before], colors)
+        views[0] = [(x - middle) @ camera.T for x in before], colors
         axes[0].set_title("before: as given")
-    _show(axes[1], [(x - centre) @ camera.T for x in model], model_colors)
-    axes[1].set_title("after: one frame")
+    with ThreadPoolExecutor() as pool:  # NumPy works on several cores that way
+        images = list(pool.map(_rendered, *zip(*views.values(), strict=True)))
+    for panel, (image, extent) in zip(views, images, strict=True):
+        axes[panel].imshow(image, extent=extent, interpolation="antialiased")
     section, width = _section([(x - centre) @ axes_of_model.T for x in model])
     # In random order, so that no scan hides the others.
     order = np.random.default_rng(0).permutation(sum(len(x) for x in section))
@@ -139,10 +144,10 @@ def _draw_flat(
     axes[1].set_title("after: one frame")
 
 
-def _show(axis: Any, parts: list[np.ndarray], colors: np.ndarray) -> None:
+def _rendered(parts: list[np.ndarray], colors: np.ndarray) -> tuple[np.ndarray, Any]:
+    """The image and its extent; scans in their colours."""
     group = np.repeat(np.arange(len(parts)), [len(x) for x in parts])
-    image, extent = render_points(np.concatenate(parts), group, colors)
-    axis.imshow(image, extent=extent, interpolation="antialiased")
+    return render_points(np.concatenate(parts), group, colors)
 
 
 def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
