@@ -26,7 +26,7 @@ from bench.studies.coverage_pairs import KINDS, CoveragePair, generated, real
 
 
 _FAILED = 0.3
-_REAL = ("bunny", "dragon")
+_REAL = ("bunny", "dragon", "newer01", "kitti07_dump", "kitchen")
 
 
 class Coverage(NamedTuple):
