@@ -28,7 +28,7 @@ from jaxreg import ParticleFilter, Status
 from jaxreg.matching import odds
 from jaxreg.neighbours import BruteForce
 from jaxreg.particle.conclude import Pair as Prepared
-from jaxreg.registrar import prepare_pair
+from jaxreg.registrar import GivenPair, prepare_pair
 
 
 #: What evidence is made of in 2D.
@@ -120,21 +120,13 @@ def _searched(
     *,
     viewed: bool,
 ) -> tuple[Array, Array, tuple[Array, ...]]:
-    pair = source, target, source_mask, target_mask
-    ready = prepare_pair(ParticleFilter(), pair)
-    frames = ready.frames
-    clouds = ready.source, ready.target
-    if viewed:
-        means = frames.source_mean, frames.target_mean
-        clouds = [
-            cloud.seen_from(-mean / frames.radius)
-            for cloud, mean in zip(clouds, means, strict=True)
-        ]
-    key = jax.random.key(0)
-    found = ready.method.solve(clouds[0], clouds[1], None, key)
+    eyes = jnp.zeros((2, source.shape[1])) if viewed else None
+    pair = GivenPair(source, target, source_mask, target_mask, eyes)
+    ready, key = prepare_pair(ParticleFilter(), pair), jax.random.key(0)
+    found = ready.method.solve(ready.source, ready.target, None, key)
     T = found.modes.T_target_source
-    index = BruteForce.build(clouds[1].points, clouds[1].mask)
-    prepared = Prepared.of(clouds[0], clouds[1], index)
+    index = BruteForce.build(ready.target.points, ready.target.mask)
+    prepared = Prepared.of(ready.source, ready.target, index)
     witness = prepared.judged.exact.witness
 
     def numbers(T: Array) -> tuple[Array, ...]:
@@ -144,7 +136,7 @@ def _searched(
         return *(x[0] for x in told), said.viewed
 
     told = found.modes.log_evidence, found.modes.weight, *lax.map(numbers, T)
-    return jax.vmap(frames.leave)(T), found.status, told
+    return jax.vmap(ready.frames.leave)(T), found.status, told
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from bench.studies.evidence_pairs import Pair
 from jaxreg import ParticleFilter, Status, register
 from jaxreg.neighbours import BruteForce
 from jaxreg.particle.conclude import Pair as Prepared
-from jaxreg.registrar import prepare_pair
+from jaxreg.registrar import GivenPair, prepare_pair
 
 
 #: What evidence is made of.
@@ -68,7 +68,7 @@ def padded(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, ...]:
 @eqx.filter_jit
 def _numbers(clouds: tuple, T: jax.Array) -> tuple[jax.Array, ...]:
     """`(q,)` the numbers of poses `(q, 4, 4)`, as the evidence has them, and holds."""
-    ready = prepare_pair(ParticleFilter(), tuple(map(jnp.asarray, clouds)))
+    ready = prepare_pair(ParticleFilter(), GivenPair(*map(jnp.asarray, clouds)))
     index = BruteForce.build(ready.target.points, ready.target.mask)
     witness = Prepared.of(ready.source, ready.target, index).judged.exact.witness
 

@@ -26,7 +26,7 @@ from jaxreg.features import Agreed, propose
 from jaxreg.particle.conclude import APART, Pair
 from jaxreg.particle.modes import distinct_modes
 from jaxreg.particle.state import Particles
-from jaxreg.registrar import Frames, prepare_pair
+from jaxreg.registrar import Frames, GivenPair, prepare_pair
 
 
 KEYS = 3
@@ -66,7 +66,7 @@ def read(path: Path) -> SensorPair:
 def proposed(clouds: tuple[jax.Array, ...]) -> tuple[Agreed, Frames, jax.Array]:
     """Proposals in the frames of the search, and the rows of distinct ones."""
     method = METHODS[1]
-    ready = prepare_pair(method, clouds)
+    ready = prepare_pair(method, GivenPair(*clouds))
     index = method.index_of(ready.target)
     spacing = Pair.of(ready.source, ready.target, index).spacing
     agreed = propose(ready.source, ready.target, spacing)

@@ -12,7 +12,7 @@ from bench.case import Case, Method, Options
 from bench.peers.local_settings import peers, solve_many
 from bench.timing import num_cores
 from bench.workloads.local_data import accuracy, draw, load
-from bench.workloads.local_pairs import own_methods, pose_alone
+from bench.workloads.local_pairs import own_methods
 
 
 PAIRS, POINTS = 64, 2_000
@@ -29,7 +29,7 @@ def cases(options: Options) -> Iterator[Case]:
     sources, targets = (np.stack(x) for x in zip(*both, strict=True))
     cores = num_cores()
     methods = []
-    for method in (*own_methods(), pose_alone()):
+    for method in own_methods():
         assert method.solve is not None
         solve = partial(method.solve, sources, targets, 0.0)
         name = f"{method.name}, one batch"

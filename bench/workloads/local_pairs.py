@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -53,7 +52,12 @@ def pose_alone() -> Method:
     """
     method = jr.ICP()
     told = f"jit, of it T_target_source alone: {written_out(method)}"
-    solve = partial(_solve_for_pose, method)
+
+    @jax.jit
+    def pose(source: Any, target: Any, init: Any) -> Any:
+        return jr.register(source, target, method, init).T_target_source
+
+    solve = partial(_solve_for_pose, pose)
     return Method("jaxreg ICP, pose alone", "jaxreg", told, solve)
 
 
@@ -63,14 +67,9 @@ def _solve(method: Any, source: np.ndarray, target: np.ndarray, _: float) -> np.
 
 
 def _solve_for_pose(
-    method: Any, source: np.ndarray, target: np.ndarray, _: float
+    pose: Any, source: np.ndarray, target: np.ndarray, _: float
 ) -> np.ndarray:
-    return np.asarray(_pose(method, source, target, np.eye(4, dtype=np.float32)))
-
-
-@eqx.filter_jit
-def _pose(method: Any, source: Any, target: Any, init: Any) -> jax.Array:
-    return jr.register(source, target, method, init).T_target_source
+    return np.asarray(pose(source, target, np.eye(4, dtype=np.float32)))
 
 
 def written_out(part: Any) -> str:

@@ -69,13 +69,13 @@ _ADVICE = {
     ),
     Status.LOW_OVERLAP: (
         "No pose was found at which enough of the two point sets agree. They may not "
-        "overlap; else draw more particles (`num_prior`) or give an initial guess "
-        "(`init`)."
+        "overlap; else draw more particles (`num_prior`), tell where the scanners "
+        "stood (`viewpoints`), or give an initial guess (`init`)."
     ),
     Status.AMBIGUOUS: (
         "Several poses agree about equally well (a symmetric object?), or surfaces "
-        "that agree can slip along each other. See the modes of the solution, or give "
-        "an initial guess."
+        "that agree can slip along each other. See the modes of the solution, tell "
+        "where the scanners stood (`viewpoints`), or give an initial guess."
     ),
     Status.DIVERGED: (
         "The steps led to a worse pose than the initial guess, which is returned. "

@@ -11,13 +11,13 @@ _AT_TERMINAL = {
     Status.LOW_OVERLAP: (
         "No pose was found at which enough of the two point sets agree. They may not "
         "overlap; else draw more poses (--budget 6000), or give what is known: "
-        "register --init, --upright, --position, multiview --positions."
+        "register --init, --upright, --viewpoint, --position, multiview --positions."
     ),
     Status.AMBIGUOUS: (
         "Several poses agree about equally well (a symmetric object?), or surfaces "
         "that agree can slip along each other. report.html shows the other poses; "
-        "--upright, register --init and --position, multiview --positions tell which "
-        "is meant."
+        "--upright, --viewpoint 0 0 0, register --init and --position, multiview "
+        "--positions tell which is meant."
     ),
     Status.DIVERGED: (
         "The steps led to a worse pose than the initial guess, which is returned. "

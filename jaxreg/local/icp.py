@@ -52,6 +52,7 @@ from jaxreg.neighbours import (
 from jaxreg.registrar import (
     AbstractRegistrar,
     Frames,
+    GivenPair,
     Modes,
     RegistrationSolution,
     prepare_pair,
@@ -177,9 +178,9 @@ class ICP(AbstractRegistrar):
             target: `(m, d)` points.
             init: the initial guess, by default the identity of centred clouds.
         """
-        pair = check_pair(source, target, None, None)
+        pair = GivenPair(*check_pair(source, target, None, None))
         ready = prepare_pair(self, pair)
-        method = cast_floats(self.in_frames(ready.frames), pair[0].dtype)
+        method = cast_floats(self.in_frames(ready.frames), pair.source.dtype)
         descending, _ = method._descending(ready.source, ready.target, ready.frames)
         T = None if init is None else ready.frames.enter(as_float_array(init, "init"))
         start = first_guess(ready.source, ready.target, T, self.with_scale)

@@ -14,10 +14,9 @@ from jaxreg._core.checks import (
     is_concrete,
 )
 from jaxreg.batching.padding import rounded_up, stacked
+from jaxreg.registration.viewpoints import check_viewpoint
 
 
-# A viewpoint lies on a point if it is nearer than this share of the scan's extent.
-_ON_POINT = 1e-6
 # Scans are thinned to some thousand points; of very large ones so many are enough.
 _MOST_POINTS = 1 << 19
 _WORDS = {1: "one or more", 2: "two or more"}
@@ -104,26 +103,7 @@ def checked_viewpoints(
             f"shape {eyes.shape}."
         )
     if is_concrete(eyes) and is_concrete(points) and is_concrete(mask):
-        _check_apart(np.asarray(eyes), unknown, np.asarray(points), np.asarray(mask))
+        host = np.asarray(eyes), np.asarray(points), np.asarray(mask)
+        for i in np.flatnonzero(~unknown):
+            check_viewpoint(host[0][i], host[1][i], host[2][i], f"viewpoints[{i}]")
     return jnp.where(unknown[:, None], jnp.nan, eyes.astype(points.dtype))
-
-
-def _check_apart(
-    eyes: np.ndarray, unknown: np.ndarray, points: np.ndarray, mask: np.ndarray
-) -> None:
-    for i in np.flatnonzero(~unknown):
-        if not np.all(np.isfinite(eyes[i])):
-            raise ValueError(
-                f"viewpoints[{i}]: wanted finite numbers, found {eyes[i].tolist()}; "
-                "give None where a viewpoint is not known."
-            )
-        valid = np.flatnonzero(mask[i] & np.all(np.isfinite(points[i]), axis=1))
-        if not len(valid):
-            continue
-        distance = np.linalg.norm(points[i, valid] - eyes[i], axis=1)
-        row = np.argmin(distance)
-        if distance[row] <= _ON_POINT * np.max(distance):
-            raise ValueError(
-                f"viewpoints[{i}]: is a point of the scan, row {valid[row]}. Leave out "
-                "rows that stand for missing returns."
-            )

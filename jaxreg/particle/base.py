@@ -43,6 +43,7 @@ from jaxreg.particle.state import Particles
 from jaxreg.registrar import (
     AbstractIndexedRegistrar,
     Frames,
+    GivenPair,
     RegistrationSolution,
     SearchTrace,
     prepare_pair,
@@ -147,8 +148,8 @@ class AbstractSearch(AbstractIndexedRegistrar):
     def _thinned(self, points: Points, mask: Mask, num: int) -> PointCloud:
         return thin(points, mask, num, _NORMAL_NEIGHBOURS)
 
-    def problem(self, pair: tuple[Array, ...], key: Key) -> Problem:
-        """What `search` works on, of a source, a target and their masks; traced."""
+    def problem(self, pair: GivenPair, key: Key) -> Problem:
+        """What `search` works on; traced."""
         ready = prepare_pair(self, pair)
         index = self.index_of(ready.target)
         problem = Problem.of(ready.source, ready.target, index, ready.frames)

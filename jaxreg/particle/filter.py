@@ -43,6 +43,7 @@ from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy
 from jaxreg.particle.priors import AbstractPrior, GivenParticles
 from jaxreg.particle.resamplers import AbstractResampler, Systematic
 from jaxreg.particle.stepping import AbstractFilter, Filtering, run
+from jaxreg.registrar import GivenPair
 from jaxreg.robust import AbstractKernel, GemanMcClure
 
 
@@ -191,7 +192,7 @@ class ParticleFilter(AbstractFilter):
             target_mask: likewise.
         """
         pair = check_pair(source, target, source_mask, target_mask)
-        return Filtering.of(self, self.problem(pair, key))
+        return Filtering.of(self, self.problem(GivenPair(*pair), key))
 
     def search(self, key: Key, problem: Problem, init: Motion | None) -> Found:
         """The filter (PF paper, section 4.2)."""

@@ -7,6 +7,7 @@ from jaxreg.registrar.base import RegistrationSolution as RegistrationSolution
 from jaxreg.registrar.indexed import (
     AbstractIndexedRegistrar as AbstractIndexedRegistrar,
 )
+from jaxreg.registrar.prepare import GivenPair as GivenPair
 from jaxreg.registrar.prepare import PreparedPair as PreparedPair
 from jaxreg.registrar.prepare import prepare_pair as prepare_pair
 from jaxreg.registrar.trace import SearchTrace as SearchTrace

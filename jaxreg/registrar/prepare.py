@@ -1,6 +1,7 @@
 """A pair as a method's `solve` expects it: cleaned, centred and scaled, prepared."""
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,6 +14,23 @@ from jaxreg.registrar.base import AbstractRegistrar
 
 # Clouds are padded to one size where the larger is at most so many times as large.
 _MAX_PADDING = 2
+
+
+class GivenPair(NamedTuple):
+    """A pair as `register` has checked it.
+
+    Attributes:
+        source, target: `(n, d)` and `(m, d)` points.
+        source_mask, target_mask: which of them are valid.
+        viewpoints: `(2, d)` where their scanners stood, NaN where that is not known;
+            None if it is of neither.
+    """
+
+    source: Array
+    target: Array
+    source_mask: Array
+    target_mask: Array
+    viewpoints: Array | None = None
 
 
 class PreparedPair(eqx.Module):
@@ -34,12 +52,13 @@ class PreparedPair(eqx.Module):
     unit_differs: Bool[Array, ""]
 
 
-def prepare_pair(method: AbstractRegistrar, pair: tuple[Array, ...]) -> PreparedPair:
-    """Of a source, a target and their masks; traced."""
-    source, target, *masks = pair
-    if source.ndim != 2:
-        raise ValueError(f"source: wanted shape (n, d), found {source.shape}.")
-    sides = on_both(Side.of, *_levelled((source, masks[0]), (target, masks[1])))
+def prepare_pair(method: AbstractRegistrar, pair: GivenPair) -> PreparedPair:
+    """Of a source, a target, their masks and perhaps their viewpoints; traced."""
+    num, other = len(pair.source), len(pair.target)
+    if pair.source.ndim != 2:
+        raise ValueError(f"source: wanted shape (n, d), found {pair.source.shape}.")
+    given = (pair.source, pair.source_mask), (pair.target, pair.target_mask)
+    sides = on_both(Side.of, *_levelled(*given))
     frames = Frames(sides[0].mean, sides[1].mean, sides[1].radius)
     method = method.in_frames(frames)
     clouds = on_both(
@@ -49,11 +68,16 @@ def prepare_pair(method: AbstractRegistrar, pair: tuple[Array, ...]) -> Prepared
             for side in sides
         ),
     )
-    source_cloud, target_cloud = (cloud.followed() for cloud in clouds)
+    clouds = tuple(cloud.followed() for cloud in clouds)
+    if pair.viewpoints is not None:
+        means = jnp.stack([side.mean for side in sides])
+        eyes = (pair.viewpoints - means) / frames.radius
+        seen = zip(clouds, eyes, strict=True)
+        clouds = on_both(lambda x: x[0].seen_from(x[1]), *seen)
     return PreparedPair(
         method,
-        source_cloud.first(len(source)),
-        target_cloud.first(len(target)),
+        clouds[0].first(num),
+        clouds[1].first(other),
         frames,
         sides[0].enough & sides[1].enough,
         jnp.abs(jnp.log(sides[0].radius / sides[1].radius)) > math.log(OTHER_UNIT),

@@ -23,7 +23,7 @@ from jaxreg.batching.padding import (
 from jaxreg.batching.progress import tell
 from jaxreg.batching.side_by_side import side_by_side
 from jaxreg.batching.threads import map_in_threads, num_cores
-from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
+from jaxreg.registrar import AbstractRegistrar, GivenPair, RegistrationSolution
 from jaxreg.registration.pair import register_pair
 
 
@@ -33,8 +33,8 @@ _CHUNK = 8
 # Rows of padding that cost as much time as compiling another program, some seconds.
 _MOST_PADDING = 1 << 24
 
-# Sources, targets, masks of both, initial poses, and the data of keys.
-_Pairs = tuple[Array, Array, Array, Array, Array | None, Array | None]
+# Pairs, initial poses, and the data of keys; all with a leading axis.
+_Pairs = tuple[GivenPair, Array | None, Array | None]
 _Tree = TypeVar("_Tree")
 # Pairs of one size: their numbers, and some of them as arrays with a leading axis.
 _Group = tuple[np.ndarray, Callable[[np.ndarray], _Pairs]]
@@ -43,7 +43,7 @@ _Group = tuple[np.ndarray, Callable[[np.ndarray], _Pairs]]
 def register_batch(
     method: AbstractRegistrar,
     batch: tuple[int, ...],
-    pair: tuple[Array, ...],
+    pair: GivenPair,
     init: Array | None,
     key: Array | None,
     batch_size: int | None,
@@ -57,7 +57,7 @@ def register_batch(
     def flat(x: Array) -> Array:
         return x.reshape(num, *x.shape[len(batch) :])
 
-    every = (*map(flat, pair), None if init is None else flat(init), data)
+    every = (*jax.tree.map(flat, (pair, init)), data)
     tell(progress, _STAGE, 0, num, every)
     threads = devices is None and num > 0 and _in_threads(method, every)
     every = _on_host(every) if threads else every
@@ -76,6 +76,7 @@ def register_batch(
 def register_lists(
     method: AbstractRegistrar,
     lists: tuple[list[Array], ...],
+    viewpoints: Array | None,
     init: Array | None,
     key: Array | None,
     batch_size: int | None,
@@ -85,22 +86,25 @@ def register_lists(
     """Of each pair of two lists; they are padded to few sizes."""
     sources, targets, source_masks, target_masks = lists
     data, impl = _split(key, len(sources))
-    tell(progress, _STAGE, 0, len(sources), lists, init, data)
-    threads = devices is None and _in_threads(method, (lists, init, data))
-    each = _on_host((init, data)) if threads else (init, data)
+    each = viewpoints, init, data
+    tell(progress, _STAGE, 0, len(sources), lists, each)
+    threads = devices is None and _in_threads(method, (lists, each))
+    each = _on_host(each) if threads else each
 
     def group(sizes: np.ndarray, members: np.ndarray) -> _Group:
         n, m = sizes.tolist()
 
         def of_rows(rows: np.ndarray) -> _Pairs:
             rows = members[rows]
-            return (
+            seen, init, data = jax.tree.map(lambda x: _on_device(x[rows]), each)
+            pairs = GivenPair(
                 stacked([sources[i] for i in rows], n),
                 stacked([targets[i] for i in rows], m),
                 stacked([source_masks[i] for i in rows], n),
                 stacked([target_masks[i] for i in rows], m),
-                *jax.tree.map(lambda x: _on_device(x[rows]), each),
+                seen,
             )
+            return pairs, init, data
 
         return members, of_rows
 
@@ -153,7 +157,7 @@ def _register_groups(
 
         def some(rows: np.ndarray, of_rows: Callable = of_rows) -> RegistrationSolution:
             pairs = spread_rows(devices, of_rows(rows))
-            num_points = pairs[0].shape[1] + pairs[1].shape[1]
+            num_points = pairs[0].source.shape[1] + pairs[0].target.shape[1]
             lanes = side_by_side(batch_size, num_points, pairs)
             return _register_rows(method, pairs, impl, lanes, devices)
 
@@ -205,13 +209,13 @@ def _register_rows(
 ) -> RegistrationSolution:
     """One group after another: memory stays bounded."""
 
-    def one(pair: _Pairs) -> RegistrationSolution:
-        *arrays, init, data = pair
+    def one(given: _Pairs) -> RegistrationSolution:
+        pair, init, data = given
         key = None if data is None else jax.random.wrap_key_data(data, impl=impl)
-        return register_pair(method, tuple(arrays), init, key)
+        return register_pair(method, pair, init, key)
 
     # Groups of one would be vectorised over an axis of one: conditions become selects.
-    num = len(pairs[0])
+    num = len(pairs[0].source)
     size = min(batch_size, num) if batch_size > 1 else None
 
     def some(pairs: _Pairs) -> RegistrationSolution:

@@ -14,6 +14,7 @@ from jaxreg.local import Curvature, tangent_unit
 from jaxreg.matching import NO_EVIDENCE
 from jaxreg.registrar import (
     AbstractRegistrar,
+    GivenPair,
     Modes,
     RegistrationSolution,
     prepare_pair,
@@ -27,11 +28,11 @@ _DOUBTED = Status.LOW_OVERLAP, Status.AMBIGUOUS, Status.DIVERGED
 @control.over_devices
 def register_pair(
     method: AbstractRegistrar,
-    pair: tuple[Array, ...],
+    pair: GivenPair,
     init: Array | None,
     key: Array | None,
 ) -> RegistrationSolution:
-    """Of sources, targets and their masks; traced."""
+    """Of sources, targets, their masks and viewpoints; traced."""
     ready = prepare_pair(method, pair)
     init = None if init is None else ready.frames.enter(init)
     solution = ready.method.solve(ready.source, ready.target, init, key)

@@ -37,7 +37,7 @@ from jaxreg.batching.padding import (
 )
 from jaxreg.local import ICP
 from jaxreg.particle import AbstractSearch, ParticleFilter
-from jaxreg.registrar import AbstractRegistrar, RegistrationSolution
+from jaxreg.registrar import AbstractRegistrar, GivenPair, RegistrationSolution
 from jaxreg.registration.far import (
     check_prior_fits,
     moved_back,
@@ -46,6 +46,7 @@ from jaxreg.registration.far import (
 )
 from jaxreg.registration.many import register_batch, register_lists
 from jaxreg.registration.pair import register_pair
+from jaxreg.registration.viewpoints import checked_viewpoints
 
 
 # Lists come first: they are objects, too.
@@ -59,6 +60,7 @@ def register(  # pyright: ignore[reportOverlappingOverload]
     *,
     source_mask: ArrayLike | None = None,
     target_mask: ArrayLike | None = None,
+    viewpoints: Sequence[ArrayLike | None] | None = None,
     batch_size: int | None = None,
     progress: Progress | None = None,
     mesh: Mesh | AbstractMesh | None = None,
@@ -75,6 +77,7 @@ def register(
     *,
     source_mask: ArrayLike | None = None,
     target_mask: ArrayLike | None = None,
+    viewpoints: Sequence[ArrayLike | None] | None = None,
     batch_size: int | None = None,
     progress: Progress | None = None,
     mesh: Mesh | AbstractMesh | None = None,
@@ -90,6 +93,7 @@ def register(
     *,
     source_mask: ArrayLike | None = None,
     target_mask: ArrayLike | None = None,
+    viewpoints: Sequence[ArrayLike | None] | None = None,
     batch_size: int | None = None,
     progress: Progress | None = None,
     mesh: Mesh | AbstractMesh | None = None,
@@ -122,6 +126,12 @@ def register(
         source_mask: `(n,)` True for valid points, for a list a list of masks or None;
             rows that are not finite are masked in any case.
         target_mask: `(m,)` likewise.
+        viewpoints: where the scanners of source and target stood, each `(d,)` in its
+            own cloud's frame, one for all pairs or with leading axes like theirs, or
+            None where that is not known. What a scanner saw through is free: poses
+            that put points of the other cloud there are believed less. Of scans in
+            sensors' frames they are zeros; indoors and in the plane they tell rooms
+            apart. Only of scans taken from one place each, of what did not move.
         batch_size: of many pairs, those that a core or an accelerator registers side by
             side; memory grows with it. By default one after another on a CPU, where
             that is quickest, and a million points at a time on an accelerator.
@@ -198,15 +208,20 @@ def register(
     there = near_origin(target, target_mask, "target")
     check_prior_fits(method, here, there)
     init = moved_guess(init, here, there)
+    if scaled and viewpoints is not None:
+        raise ValueError("viewpoints: not with ICP(with_scale=True).")
     if is_list_of_clouds(source) or is_list_of_clouds(target):
         lists = check_lists(here.points, there.points, *masks)
         batch = (len(lists[0]),)
         init = _check_init(init, batch, lists[0][0], scaled)
-        found = register_lists(method, lists, init, key, *how)
+        eyes = checked_viewpoints(viewpoints, (here, there), lists, batch)
+        found = register_lists(method, lists, eyes, init, key, *how)
         return [moved_back(sol, here.at(i), there.at(i)) for i, sol in enumerate(found)]
-    pair = check_pair(here.points, there.points, *masks)
-    batch = pair[0].shape[:-2]
-    init = _check_init(init, batch, pair[0], scaled)
+    clouds = check_pair(here.points, there.points, *masks)
+    batch = clouds[0].shape[:-2]
+    init = _check_init(init, batch, clouds[0], scaled)
+    eyes = checked_viewpoints(viewpoints, (here, there), clouds, batch)
+    pair = GivenPair(*clouds, eyes)
     if batch:
         sol = register_batch(method, batch, pair, init, key, *how)
     else:
@@ -236,15 +251,17 @@ def _check_init(
         ) from err
 
 
-def _rounded_up(pair: tuple[Array, ...]) -> tuple[Array, ...]:
+def _rounded_up(pair: GivenPair) -> GivenPair:
     """With masked rows added to concrete arrays, so that few sizes compile."""
-    if not all(map(is_concrete, pair)):
+    clouds = pair[:4]
+    if not all(map(is_concrete, clouds)):
         return pair
-    return tuple(lengthened(x, rounded_up(len(x))) for x in pair)
+    longer = (lengthened(x, rounded_up(len(x))) for x in clouds)
+    return GivenPair(*longer, viewpoints=pair.viewpoints)
 
 
-# A source, a target and masks of both; an initial pose; a key.
-_Given = tuple[tuple[Array, ...], Array | None, Array | None]
+# A pair; an initial pose; a key.
+_Given = tuple[GivenPair, Array | None, Array | None]
 
 
 @kept_program

@@ -200,7 +200,8 @@ def _registrations() -> Iterator[Call]:
     far["init"] = np.eye(4)
     far["init"][:3, 3] = -3.5e6
     yield Call("register far away", _locally, {**local, **far, **numbers}, untrue)
-    by = {"method": _icp(), "init": None, "progress": None}
+    aside = np.full(3, 9.0, np.float32)
+    by = {"method": _icp(), "init": None, "progress": None, "viewpoints": [aside, None]}
     yield Call("register by", jr.register, {**local, **by}, untrue, dear=True)
     search = jr.ParticleFilter(**_SEARCH)
     free = {"source": SOURCE, "target": TARGET, "method": search, "key": KEY}
@@ -209,6 +210,7 @@ def _registrations() -> Iterator[Call]:
     many = {"method": _icp(), "batch_size": 1}
     pairs = {"source": [SOURCE, SOURCE[:44]], "target": [TARGET, TARGET]}
     lists = {**pairs, "init": np.stack([eye, eye]), **many}
+    lists["viewpoints"] = [[aside, aside], np.stack([aside, -aside])]
     yield Call("register of lists", jr.register, lists, untrue, dear=True)
     batch = {"source": np.stack([SOURCE] * 2), "target": np.stack([TARGET] * 2)}
     name = "register of a batch"

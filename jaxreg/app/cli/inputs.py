@@ -67,6 +67,26 @@ class Scans:
         ]
         return moved, np.stack(middles)
 
+    def check_viewpoint(
+        self, viewpoint: tuple[float, ...] | None, units: Sequence[float] | None = None
+    ) -> None:
+        """Requires a place that is none of the points, or none.
+
+        Args:
+            viewpoint: `--viewpoint`, in the unit of each file.
+            units: as in `load_scans`.
+        """
+        check_point(viewpoint, self.points[0].shape[1], "--viewpoint")
+        if viewpoint is None:
+            return
+        units = [1.0] * len(self.points) if units is None else units
+        for points, place, unit in zip(self.points, self.places, units, strict=True):
+            if np.any(np.all(points == unit * np.asarray(viewpoint), axis=1)):
+                raise InputError(
+                    f"{place}: has points at --viewpoint.\n"
+                    "Leave out rows that stand for missing returns."
+                )
+
 
 def load_scans(
     paths: Sequence[Path],

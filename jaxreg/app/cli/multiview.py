@@ -14,7 +14,7 @@ from jaxreg._core.status import Status
 from jaxreg._core.typing import Progress
 from jaxreg.app.cli import outputs
 from jaxreg.app.cli.cluster import executor_of
-from jaxreg.app.cli.inputs import Scans, check_point, load_scans, read_positions
+from jaxreg.app.cli.inputs import Scans, load_scans, read_positions
 from jaxreg.app.cli.known import (
     NOTHING,
     is_told,
@@ -46,7 +46,7 @@ def run(command: Multiview, session: Session) -> int:
         command.check_model()
         scans = load_scans(command.scans)
         command.check_known(scans.points[0].shape[1])
-        _check_viewpoint(command.viewpoint, scans)
+        scans.check_viewpoint(command.viewpoint)
         located = _located(command, scans)
         known = read_known_scans(command, scans.names, scans.points[0].shape[1])
         truth = None if command.truth is None else _read_truth(command.truth, scans)
@@ -256,19 +256,6 @@ def _covariances(
     for c, found in enumerate(each):
         out[component == c] = found[component == c]
     return out
-
-
-def _check_viewpoint(viewpoint: tuple[float, ...] | None, scans: Scans) -> None:
-    d = scans.points[0].shape[1]
-    check_point(viewpoint, d, "--viewpoint")
-    if viewpoint is None:
-        return
-    for points, place in zip(scans.points, scans.places, strict=True):
-        if np.any(np.all(points == np.asarray(viewpoint), axis=1)):
-            raise InputError(
-                f"{place}: has points at --viewpoint.\n"
-                "Leave out rows that stand for missing returns."
-            )
 
 
 def _pairs(motions: Any) -> Pairs:

@@ -99,6 +99,11 @@ class SearchOptions(Options):
 class ModelOptions(SearchOptions):
     """Options of the commands that write scans from files in one frame."""
 
+    viewpoint: Annotated[
+        tuple[float, ...] | None,
+        tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
+    ] = None
+    """Where the scanner stood in the frame of every scan, in its unit: often 0 0 0."""
     save_aligned: bool = False
     """Write each scan whole in the common frame, too: its format, all it holds."""
     color: Color = "scan"
@@ -160,6 +165,8 @@ class Register(ModelOptions):
 
     def check_method(self) -> None:
         """Refuses options that the method cannot use."""
+        if self.scale and self.viewpoint is not None:
+            raise InputError("--viewpoint: not with --scale.")
         icp = {"--scale": self.scale, "--max-distance": self.max_distance is not None}
         search = {"--upright": self.upright, "--position": self.position is not None}
         wrong = icp if self.method != "icp" else {}
@@ -191,11 +198,6 @@ class Multiview(ModelOptions, KnownOptions):
     """Poses as the Stanford repository has them, metres: adds a table of errors."""
     order: Order = "any"
     """Of the scans; sequential if each overlaps the next: fewer pairs are tried."""
-    viewpoint: Annotated[
-        tuple[float, ...] | None,
-        tyro.conf.arg(metavar="X Y [Z]", help_behavior_hint="(default: unknown)"),
-    ] = None
-    """Where the scanner stood in the frame of every scan, in its unit: often 0 0 0."""
     positions: Annotated[
         Path | None,
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: none)"),

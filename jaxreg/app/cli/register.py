@@ -38,13 +38,15 @@ def run(command: Register, session: Session) -> int:
     dim = scans.points[0].shape[1]
     command.check_known(dim)
     check_point(command.position, dim, "--position")
+    scans.check_viewpoint(command.viewpoint, units)
     if command.budget <= Register.budget:
         compile_in_a_hurry()
     key, method = key_of(command), _method(command, scans)
     init = _guess(command, scans, units)
     with session.progress() as progress, session.timed("run", computes=True):
         progress("registering", 0, 1)
-        result, modes, covariances = _register(scans, key, method, init)
+        eyes = _viewpoints(command, scans, units)
+        result, modes, covariances = _register(scans, key, method, init, eyes)
         progress("registering", 1, 1)
     result = dataclasses.replace(result, units=np.asarray(units))
     result = outputs.write_files(
@@ -118,16 +120,29 @@ def _guess(
     return T
 
 
+def _viewpoints(
+    command: Register, scans: Scans, units: Sequence[float]
+) -> list[np.ndarray] | None:
+    """`--viewpoint` of source and target, in scans that are moved to their middles."""
+    if command.viewpoint is None:
+        return None
+    eyes = np.outer(units, command.viewpoint) - scans.centred()[1]
+    return list(eyes[::-1])
+
+
 def _register(
     scans: Scans,
     key: jax.Array,
     method: jaxreg.AbstractRegistrar,
     init: np.ndarray | None,
+    viewpoints: list[np.ndarray] | None,
 ) -> tuple[Result, tuple[np.ndarray, ...], np.ndarray]:
     """The result, the modes of the posterior, and the covariances of both poses."""
     centred, middles = scans.centred()
     target, source = (x[np.isfinite(x).all(axis=1)] for x in centred)
-    sol = jaxreg.register(source, target, method, key=key, init=init)
+    sol = jaxreg.register(
+        source, target, method, key=key, init=init, viewpoints=viewpoints
+    )
     scaled = isinstance(method, jaxreg.ICP) and method.with_scale
     T_target_source = outputs.uncentre(
         np.asarray(sol.T_target_source)[None], middles[0], middles[1], scaled

@@ -160,7 +160,13 @@ def registered(T: np.ndarray, status: int, overlap: float) -> Any:
 
 
 def register_s1_onto_s0(
-    source: np.ndarray, target: np.ndarray, method: Any, *, key: Any, init: Any = None
+    source: np.ndarray,
+    target: np.ndarray,
+    method: Any,
+    *,
+    key: Any,
+    init: Any = None,
+    viewpoints: Any = None,
 ) -> Any:
     assert np.isfinite(source).all()
     T = shift(-np.median(CLOUD, axis=0)) @ POSES[1] @ shift(middle_of(POSES[1]))

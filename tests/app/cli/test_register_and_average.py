@@ -94,6 +94,36 @@ def test_a_position_is_that_of_the_origin_in_the_target(
     assert "--position: wanted 3 finite numbers" in capsys.readouterr().err
 
 
+def test_viewpoints_are_moved_with_the_scans_in_the_units_of_their_files(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    save_scans(folder)
+    np.save("mm.npy", 1000 * np.load("s1.npy"))
+    given = []
+
+    def register(source: Any, target: Any, method: Any, **rest: Any) -> Any:
+        given.append((source, target, rest["viewpoints"]))
+        return register_s1_onto_s0(source, target, method, **rest)
+
+    monkeypatch.setattr(jaxreg, "register", register)
+    run = ["register", "mm.npy", "s0.npy", "--unit", "mm", "m", "--viewpoint"]
+    assert main([*run, "0", "-9", "1"]) == 0
+    source, target, eyes = given[0]
+    for eye, points, name, unit in zip(
+        eyes, (source, target), ("s1.npy", "s0.npy"), (1e-3, 1), strict=True
+    ):
+        moved = np.load(name)[0] - points[0]
+        np.testing.assert_allclose(eye + moved, [0, -9 * unit, unit], atol=1e-5)
+    assert main([*run, "0", "1"]) == 2
+    assert "--viewpoint: wanted 3 finite numbers" in capsys.readouterr().err
+    place = [str(x) for x in np.load("s0.npy")[3]]
+    assert main(["register", "s1.npy", "s0.npy", "--viewpoint", *place]) == 2
+    assert "s0.npy: has points at --viewpoint" in capsys.readouterr().err
+    scaled = ["register", "s1.npy", "s0.npy", "--method", "icp", "--scale"]
+    assert main([*scaled, "--viewpoint", "0", "0", "0"]) == 2
+    assert "--viewpoint: not with --scale" in capsys.readouterr().err
+
+
 def _fails(monkeypatch: pytest.MonkeyPatch, T: np.ndarray, status: Status) -> None:
     def register(source: np.ndarray, target: np.ndarray, method: Any, **_: Any) -> Any:
         return registered(T, status, 0.2 if np.isfinite(T).all() else 0.0)
