@@ -22,6 +22,7 @@ import numpy as np
 from jaxreg._core.checks import is_concrete
 from jaxreg._core.platforms import platform_of, traced_for
 from jaxreg._core.program_files import Hole, digest, pickled, read, write
+from jaxreg._core.program_room import make_room
 
 
 P = ParamSpec("P")
@@ -40,6 +41,8 @@ def kept_program(function: Callable[P, Out]) -> Callable[P, Out]:
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Out:
         platform = platform_of(args, kwargs)
+        if platform is not None:
+            make_room()
         if _STORE is None or platform is None:
             return plain(platform, args, kwargs)
         program = _STORE.program(traced, platform, args, kwargs)

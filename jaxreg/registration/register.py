@@ -164,10 +164,12 @@ def register(
 
     Compilation:
         Outside of a transformation clouds are padded to sizes rounded up
-        (`jaxreg.batching.padding.rounded_up`), those of a list to the one that holds
-        the largest, which changes an answer by rounding only: similar sizes share a
-        program. Where a list would get more than 2^24 rows more, each pair of sizes
-        compiles once.
+        (`jaxreg.batching.padding.rounded_up`), two an octave, both to one where theirs
+        are next to each other; those of a list to the one that holds the largest. That
+        changes an answer by rounding only, and similar sizes share a program. Where a
+        list would get more than 2^24 rows more, each pair of sizes compiles once. A
+        process on Linux holds some twenty searches of different sizes; before it is
+        full all programs are dropped (`jaxreg._core.program_room`), which is logged.
 
     Devices:
         Along "pair" each registers its own pairs and hears of no other. Bits are the
@@ -252,11 +254,18 @@ def _check_init(
 
 
 def _rounded_up(pair: GivenPair) -> GivenPair:
-    """With masked rows added to concrete arrays, so that few sizes compile."""
+    """With masked rows added to concrete arrays, so that few sizes compile.
+
+    Both get one size where these are next to each other: else pairs of scans of similar
+    sizes would be four programs.
+    """
     clouds = pair[:4]
     if not all(map(is_concrete, clouds)):
         return pair
-    longer = (lengthened(x, rounded_up(len(x))) for x in clouds)
+    sizes = [rounded_up(len(x), an_octave=2) for x in clouds[:2]]
+    if max(sizes) <= 1.5 * min(sizes):
+        sizes = [max(sizes)] * 2
+    longer = (lengthened(x, num) for x, num in zip(clouds, 2 * sizes, strict=True))
     return GivenPair(*longer, viewpoints=pair.viewpoints)
 
 
