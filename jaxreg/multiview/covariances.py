@@ -6,7 +6,7 @@ The motions are those that were measured last, from poses that others hold: so w
 surfaces of a pair say little of it, its motion says what the poses said.
 What a cell of the surfaces contributes to all pairs that match there, and through them
 to every pose, is one term, as the pairs of a scan share its errors: motions that agree
-with each other may be wrong together.
+with each other may be wrong together. Wide cells tell whether neighbours err alike.
 """
 
 from typing import Any
@@ -26,7 +26,12 @@ from jaxreg.multiview.given_scans import GivenScans
 from jaxreg.multiview.prepared_scans import PreparedScans
 from jaxreg.multiview.scan_set import ScanSet
 from jaxreg.multiview.solution import ReconstructionSolution
-from jaxreg.multiview.surface_errors import SurfaceErrors, num_sums
+from jaxreg.multiview.surface_errors import (
+    CELL,
+    WIDE_CELL,
+    SurfaceErrors,
+    num_sums,
+)
 from jaxreg.particle import AbstractSearch, ParticleFilter
 
 
@@ -193,15 +198,32 @@ def _moves(
     (v, d), turn = scans.mean.shape, surfaces.to_own_axes
     k, num = lie.tangent_dim(d), num_sums(v)
 
-    def velocities(around: Float[Array, "r v k"]) -> Float[Array, "r v k c"]:
+    def velocities(
+        around: Float[Array, "r v k"], *sizes: float
+    ) -> Float[Array, "r v k c"]:
         def errors(i: Array, j: Array) -> tuple[Array, Array]:
-            return surfaces.errors(i, j, around, num)
+            return surfaces.errors(i, j, around, jnp.asarray(sizes, T.dtype), num)
 
         return follow_motions(edges, weight, T, first, errors, (len(around), num))
 
-    (at_rest,) = velocities(jnp.zeros((1, v, k), T.dtype))
+    at_rest, wide = velocities(jnp.zeros((2, v, k), T.dtype), CELL, WIDE_CELL)
     # Cells that go either way make poses as far off as the truth is.
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (_AROUND, num))
     around = jnp.einsum("rc,vbc,vab->rva", jnp.asarray(signs, T.dtype), at_rest, turn)
     unit = jnp.where(jnp.arange(k) < d, scans.radius, 1)
-    return velocities(around), unit[:, None] * turn
+    longer = jnp.sqrt(_growth(at_rest, wide))
+    return longer * velocities(around, *[CELL] * _AROUND), unit[:, None] * turn
+
+
+def _growth(
+    cells: Float[Array, "v k c"], wide: Float[Array, "v k c"]
+) -> Float[Array, ""]:
+    """Of variances by wide cells: in the mean over all poses and axes, one at least.
+
+    Errors may have one sign over more than a cell, as those of planes through samples
+    of curved surfaces, and of scans that are warped.
+    """
+    cells, wide = (jnp.sum(x**2, axis=-1) for x in (cells, wide))
+    told = cells > 0
+    growth = jnp.where(told, wide / jnp.where(told, cells, 1), 0)
+    return jnp.maximum(jnp.sum(growth) / jnp.maximum(jnp.sum(told), 1), 1)
