@@ -72,6 +72,9 @@ def test_viewpoints_of_map_coordinates_are_moved_with_their_clouds(pairs, seen):
     eyes = AT + far, AT + far
     sol = jr.register(source + far, target + far, jr.ICP(), shifted, viewpoints=eyes)
     np.testing.assert_allclose(sol.log_evidence, seen.log_evidence, atol=0.3)
+    eyes = None, np.zeros(3)
+    with pytest.raises(ValueError, match=r"viewpoints\[1\]: wanted shape \(2,\)"):
+        jr.register(source + far, target + far, jr.ICP(), shifted, viewpoints=eyes)
 
 
 @pytest.mark.parametrize(

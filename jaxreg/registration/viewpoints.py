@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxreg._core.checks import as_float_array, as_host_numbers, is_concrete
+from jaxreg._core.platforms import platform_of
 from jaxreg.registration.far import Moved
 
 
@@ -64,7 +65,9 @@ def _of_side(
     if viewpoint is None:
         return np.full(shape, np.nan, one.dtype)
     if moved.origin is not None:
-        viewpoint = as_host_numbers(viewpoint, name) - moved.origin
+        viewpoint = as_host_numbers(viewpoint, name)
+        if viewpoint.shape in (shape, shape[-1:]):
+            viewpoint = viewpoint - moved.origin
     eye = as_float_array(viewpoint, name)
     if eye.shape not in (shape, shape[-1:]):
         raise ValueError(
@@ -75,15 +78,20 @@ def _of_side(
     if not is_concrete(eye):
         return jnp.broadcast_to(eye.astype(one.dtype), shape)
     eye = np.broadcast_to(np.asarray(eye, one.dtype), shape)
-    if is_concrete(one) and is_concrete(mask[0]):
+    if _on_host(points, mask):
+        host, valid = jax.tree.map(np.asarray, (points, mask))
         for index in np.ndindex(*batch):
+            at = index[0] if isinstance(points, list) else index
             where = name + "".join(f"[{k}]" for k in index)
-            check_viewpoint(eye[index], _at(points, index), _at(mask, index), where)
+            check_viewpoint(eye[index], host[at], valid[at], where)
     return eye
 
 
-def _at(x: _Rows, index: tuple[int, ...]) -> np.ndarray:
-    return np.asarray(x[index[0]] if isinstance(x, list) else x[index])
+def _on_host(*rows: _Rows) -> bool:
+    """Whether all can be read without moving them."""
+    arrays = jax.tree.leaves(rows)
+    here = all(is_concrete(x) and x.is_fully_addressable for x in arrays)
+    return here and platform_of(arrays) == "cpu"
 
 
 def check_viewpoint(
