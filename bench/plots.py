@@ -39,6 +39,7 @@ SERIES = {
         True,
         (
             "jaxreg ICP",
+            "jaxreg ICP, pose alone",
             "NumPy+SciPy plane",
             "small_gicp GICP",
             "small_gicp GICP voxel 0.01",
