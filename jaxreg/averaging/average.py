@@ -168,8 +168,8 @@ def average(
 
     Compilation: graphs of a list are padded to one of few numbers of poses, four an
     octave from 8 on, and to the edges of the largest that shares it; each such size
-    compiles once. So is a graph of up to 128 poses outside of `jit`: two numbers of
-    poses and of edges an octave. Padding changes an answer by rounding.
+    compiles once. So is a graph of up to 128 poses outside of `jit`: to a power of two,
+    and to one of edges, twice as many or more. Padding changes an answer by rounding.
     """
     method = Correntropy() if method is None else method
     check_method(method, AbstractAverager)

@@ -142,13 +142,11 @@ def solution(
     width = jnp.full((2,), jnp.inf, dtype) if kernel_width is None else kernel_width
     trust = jnp.where(graph.mask & (graph.weight > 0), trust, 0)
     evidence = likelihood.log_evidence(T_world_i) if evidence is None else evidence
-    none = likelihood.nothing_agrees(evidence)
-    status = jnp.where(none, Status.NO_AGREEMENT, status_of(done))
     return AveragingSolution(
         T_world_i=T_world_i,
         edge_weight=trust,
         agreement=weighted_mean((trust > 0.5).astype(dtype), graph.weight),
-        status=status.astype(jnp.int32),
+        status=status_of(done),
         placed=jnp.ones(T_world_i.shape[:1], dtype=bool),
         component=jnp.zeros(T_world_i.shape[:1], dtype=jnp.int32),
         kernel_width=width,

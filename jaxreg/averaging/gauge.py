@@ -8,10 +8,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg._core import control
 from jaxreg._core.arrays import cast_floats
+from jaxreg._core.checks import is_concrete
 from jaxreg._core.programs import kept_program
 from jaxreg._core.status import Status
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution
+from jaxreg.averaging.likelihood import Likelihood
 from jaxreg.averaging.methods.pose_graph_lm import PoseGraphLM
 from jaxreg.averaging.unit import in_range
 from jaxreg.geometry import lie
@@ -29,7 +31,7 @@ def average_graph(
 ) -> AveragingSolution:
     """`average` of checked arguments; frames that are not `present` are padding."""
     reduced, method, T_start, gauge = _prepared(graph, method, init)
-    return _placed(method.solve(reduced, T_start, key), gauge, present)
+    return _concluded(reduced, method.solve(reduced, T_start, key), gauge, present)
 
 
 @control.over_devices
@@ -41,7 +43,30 @@ def follow_graph(
     assert isinstance(method, PoseGraphLM)
     assert T_start is not None
     found = jnp.asarray(True), jnp.zeros((), jnp.int32), None
-    return _placed(method.solution_at(reduced, T_start, *found), gauge, present)
+    found = method.solution_at(reduced, T_start, *found)
+    return _concluded(reduced, found, gauge, present)
+
+
+def _concluded(
+    reduced: PoseGraph,
+    found: AveragingSolution,
+    gauge: "_Gauge",
+    present: Bool[Array, " v"] | None,
+) -> AveragingSolution:
+    """In the frame that was given; says so if nothing agrees."""
+    evidence = found.log_evidence
+    # Few answers are doubted: what judges them is compiled for one that is.
+    if not is_concrete(evidence) or float(evidence) <= 0:
+        found = _doubted(reduced, found)
+    return _placed(found, gauge, present)
+
+
+@kept_program
+def _doubted(reduced: PoseGraph, found: AveragingSolution) -> AveragingSolution:
+    """NO_AGREEMENT where that is so."""
+    none = Likelihood.of(reduced).nothing_agrees(found.log_evidence)
+    status = jnp.where(none, Status.NO_AGREEMENT, found.status)
+    return eqx.tree_at(lambda s: s.status, found, status.astype(jnp.int32))
 
 
 class _Gauge(NamedTuple):

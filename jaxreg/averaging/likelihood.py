@@ -35,6 +35,7 @@ What is left out: the determinant of the reduced Laplacian, which differs little
 hypotheses, and that rotation and translation may have deviations of their own.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -48,8 +49,8 @@ from jaxreg._core import control
 from jaxreg._core.quantile import nearest_rank
 from jaxreg.geometry import lie
 from jaxreg.graph import trees
+from jaxreg.graph.near_edges import near_ways
 from jaxreg.graph.pose_graph import PoseGraph
-from jaxreg.linear.laplacian import DENSE_LIMIT
 
 
 #: Deviations of right edges, radians and length scales: octaves from where the normal
@@ -63,8 +64,8 @@ _LOG_ODDS = (-4.5, -3.0, -1.5, 0.0, 1.5, 3.0, 4.5)
 #: Poses that agree with more than this share of trusted edges need no search: noise
 #: leaves out about one of a hundred right ones.
 SETTLED = 0.98
-# Neighbours t that may be near. With 2 as well, sparse graphs agree by chance.
-_NEAREST = (4, 8)
+# Which of them near and far edges may have.
+_ALLOWED = np.asarray(_LOG_ODDS)[:, None] >= np.maximum(_LOG_ODDS, 0)[None]
 
 
 class Explained(NamedTuple):
@@ -132,14 +133,17 @@ class Likelihood(eqx.Module):
         none = (jnp.sum(graph.weight > 0) > self.free) & (evidence <= 0)
         return control.cond(none, of_tree, lambda: jnp.asarray(False))
 
-    def agreed_share(self, T_world_i: Float[Array, "v D D"]) -> Float[Array, ""]:
+    def agreed_share(self, told: Explained) -> Float[Array, ""]:
         """The share of the edges to spare that are likelier right than wrong.
 
         A tree agrees with its own edges, wherever it leads: only those beyond count,
         but where there are none. 0 without edges.
+
+        Args:
+            told: how some poses explain the motions.
         """
         present = jnp.sum(self.graph.weight > 0)
-        right = jnp.sum(self.explained(T_world_i).log_odds > 0)
+        right = jnp.sum(told.log_odds > 0)
         tree = self.free.astype(right.dtype)
         tree = jnp.where(present > tree, tree, 0)
         count = jnp.maximum(present - tree, 1).astype(self.graph.weight.dtype)
@@ -157,47 +161,85 @@ class Likelihood(eqx.Module):
                 random motions gain is more than Laplace's method takes off. Else wrong
                 ones may agree with each other.
         """
-        graph, dimension, deviations = self.graph, _DIMENSION, DEVIATIONS
-        if alone:
-            dimension, deviations = float(lie.tangent_dim(graph.dim)), DEVIATIONS[1:]
-        T_i_j = graph.predicted(jax.lax.stop_gradient(T_world_i))
-        sq, weigh = squared_errors(graph, T_i_j, self.scale), self.prior_odds
-        log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
-        prior = log_odds[:, None] + weigh[None]
-        none = jax.nn.softplus(prior)
-        near_ways, meant = _near_ways(graph, T_i_j, self.scale, alone)  # (t, e)
+        return jax.tree.map(lambda x: x[0], self._explained_by(T_world_i, (alone,)))
+
+    def explained_both(
+        self, T_world_i: Float[Array, "v D D"]
+    ) -> tuple[Explained, Explained]:
+        """`explained`, and where each wrong motion is `alone`, by one piece of code."""
+        both = self._explained_by(T_world_i, (False, True))
+        return jax.tree.map(lambda x: x[0], both), jax.tree.map(lambda x: x[1], both)
+
+    def _explained_by(self, T_world_i: Array, laws: tuple[bool, ...]) -> Explained:
+        """For each law, whether wrong motions are alone; a leading axis of laws."""
+        seen, meant = self._seen(jax.lax.stop_gradient(T_world_i), laws)
+        ladder = jnp.asarray(DEVIATIONS, seen.sq.dtype)
+        k, num = lie.tangent_dim(self.graph.dim), len(ladder)
+        dimensions = jnp.asarray([k if x else _DIMENSION for x in laws], ladder.dtype)
+        rows = jnp.repeat(dimensions, num), jnp.tile(ladder, len(laws))
+        rows = (*rows, jnp.repeat(meant, num, axis=0))
+        every = jax.lax.map(lambda row: self._terms(seen, *row), rows)
+        every = every.reshape(len(laws), num, *every.shape[1:])
+        # The widest is no deviation of a component.
+        fits = np.asarray([[not x] + [True] * (num - 1) for x in laws])
+        every = jnp.where(fits.reshape(*fits.shape, 1, 1, 1), every, -jnp.inf)
+        counts = fits.sum(axis=1) * np.sum(_ALLOWED) * jnp.sum(meant, axis=1)
+        of_law = functools.partial(self._likeliest, seen)
+        return jax.vmap(of_law)(every, dimensions, counts)
+
+    def _seen(self, T_world_i: Array, laws: tuple[bool, ...]) -> tuple["_Seen", Array]:
+        """What poses make of the motions, and which ways of nearness laws may mean."""
+        T_i_j = self.graph.predicted(T_world_i)
+        sq = squared_errors(self.graph, T_i_j, self.scale)
+        near, meant = near_ways(self.graph, T_i_j, self.scale, laws)
+        return _Seen(sq, near), meant
+
+    def _log_gain(
+        self, sq: Array, dimension: Array, deviation: Array
+    ) -> tuple[Array, Array]:
+        """The logarithm of g for each edge, and for one that holds exactly."""
+        most = dimension * jnp.log(_reach(self.graph.dim) / deviation)
+        return most - sq / (2 * deviation**2), most
+
+    def _terms(
+        self, seen: "_Seen", dimension: Array, deviation: Array, meant: Array
+    ) -> Float[Array, "near far t"]:
+        """The terms of log Lambda of one deviation."""
+        sq, near_ways = seen
+        prior = jnp.asarray(_LOG_ODDS, sq.dtype)[:, None] + self.prior_odds[None]
+        gain, most = self._log_gain(sq, dimension, deviation)
+        each = jax.nn.softplus(prior + gain[None]) - jax.nn.softplus(prior)
+        each = jnp.where(self.graph.weight[None] > 0, each, 0)
         both_sides = jnp.concatenate([near_ways, ~near_ways]).astype(sq.dtype)
-        # Of near and far edges.
-        allowed = np.asarray(_LOG_ODDS)[:, None] >= np.maximum(_LOG_ODDS, 0)[None]
-        reach = _reach(graph.dim)
+        sums = jnp.matmul(each, both_sides.T, precision=jax.lax.Precision.HIGHEST)
+        near, far = jnp.split(sums, 2, axis=1)
+        both = near[:, None] + far[None]
+        may = jnp.asarray(_ALLOWED)[..., None] & meant[None, None]
+        return jnp.where(may, both, -jnp.inf) - self.free * most
 
-        def log_gain(deviation: Array) -> tuple[Array, Array]:
-            """The logarithm of g for each edge, and for one that holds exactly."""
-            most = dimension * jnp.log(reach / deviation)
-            return most - sq / (2 * deviation**2), most
-
-        def terms(deviation: Array) -> Array:
-            gain, most = log_gain(deviation)
-            each = jax.nn.softplus(prior + gain[None]) - none
-            each = jnp.where(graph.weight[None] > 0, each, 0)
-            sums = jnp.matmul(each, both_sides.T, precision=jax.lax.Precision.HIGHEST)
-            near, far = jnp.split(sums, 2, axis=1)
-            both = near[:, None] + far[None]  # near, far, t
-            may = jnp.asarray(allowed)[..., None] & meant[None, None]
-            return jnp.where(may, both, -jnp.inf) - self.free * most
-
-        ladder = jnp.asarray(deviations, sq.dtype)
-        every = jax.lax.map(terms, ladder)
-        count = len(deviations) * np.sum(allowed) * jnp.sum(meant)
+    def _likeliest(
+        self, seen: "_Seen", every: Array, dimension: Array, count: Array
+    ) -> Explained:
+        """From the terms of a law."""
+        sq, near_ways = seen
+        ladder = jnp.asarray(DEVIATIONS, sq.dtype)
+        log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
         s, near, far, t = _places(every.shape)[:, jnp.argmax(every)]
         p = jnp.where(near_ways[t], log_odds[near], log_odds[far])
-        right = p + weigh + log_gain(ladder[s])[0]
+        gain, _ = self._log_gain(sq, dimension, ladder[s])
         ratio = jax.nn.logsumexp(every) - jnp.log(count.astype(sq.dtype))
         return Explained(
             jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf),
             ladder[s],
-            jnp.where(graph.weight > 0, right, -jnp.inf),
+            jnp.where(self.graph.weight > 0, p + self.prior_odds + gain, -jnp.inf),
         )
+
+
+class _Seen(NamedTuple):
+    """What poses make of the motions of a graph."""
+
+    sq: Float[Array, " e"]  # `squared_errors`
+    near: Bool[Array, "t e"]  # in each way
 
 
 def least_after_fitting(found: Explained) -> Float[Array, ""]:
@@ -244,50 +286,3 @@ def _reach(dim: int) -> float:
 def _places(shape: tuple[int, ...]) -> Int[Array, "axes size"]:
     """Where each number of an array is, read off, not divided out."""
     return jnp.asarray(np.indices(shape).reshape(len(shape), -1), jnp.int32)
-
-
-def _near_ways(
-    graph: PoseGraph, T_i_j: Float[Array, "e D D"], scale: Float[Array, ""], alone: bool
-) -> tuple[Bool[Array, "t e"], Bool[Array, " t"]]:
-    """Whether an edge is near in each way, and which ways may be meant.
-
-    Successive numbers say what is near if most edges are the steps of a sequence. Of
-    more than `DENSE_LIMIT` frames drift tells false closures, and this would count it
-    against right ones: a path that nothing bends holds all its steps exactly.
-    """
-    near = _among_nearest(graph, T_i_j, scale)
-    meant = jnp.ones(len(near), bool)
-    if alone or graph.num_poses > DENSE_LIMIT:
-        return near, meant
-    present = graph.weight > 0
-    sequence = 2 * jnp.sum(graph.successive & present) > jnp.sum(present)
-    ways = jnp.concatenate([near, graph.successive[None]])
-    return ways, jnp.append(meant, sequence)
-
-
-def _among_nearest(
-    graph: PoseGraph, T_i_j: Float[Array, "e D D"], scale: Float[Array, ""]
-) -> Bool[Array, "t e"]:
-    """Whether one end of an edge is among the t nearest measured neighbours of another.
-
-    For each t of `_NEAREST`. Nearness is that of the poses, which make T_i_j of the
-    motions: squared angle (chordal) and squared length over `scale`. Edges as near as
-    each other are so alike.
-    """
-    far = graph.dim - jnp.trace(lie.rotation(T_i_j), axis1=-2, axis2=-1)
-    shift = jnp.sum(lie.translation(T_i_j) ** 2, axis=-1) / scale**2
-    far = jnp.where(graph.weight > 0, far + shift, jnp.inf)
-    ends = graph.edges.T
-    frame, ascending = jax.lax.sort(
-        (ends.reshape(-1), jnp.concatenate([far, far])), num_keys=2
-    )
-    place = jnp.arange(len(frame), dtype=jnp.int32)
-    first = jnp.full(graph.num_poses, len(frame), jnp.int32).at[frame].min(place)
-    # The t-th nearest of each frame; all are near where there are fewer.
-    last = first[None] + jnp.asarray(_NEAREST, jnp.int32)[:, None] - 1
-    there = jnp.minimum(last, len(frame) - 1)
-    own = frame[there] == jnp.arange(graph.num_poses)[None]
-    bound = jnp.where(own & (last < len(frame)), ascending[there], jnp.inf)
-    # Compilers compute a distance more than once, not always to the same last digit.
-    bound = bound + 16 * jnp.finfo(bound.dtype).eps * (1 + bound)
-    return jnp.any(far[None, None] <= bound[:, ends], axis=1)

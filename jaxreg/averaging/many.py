@@ -65,9 +65,10 @@ def average_rounded(
     """`average_graph`, by a program that graphs of similar sizes share."""
     arrays = jax.tree.leaves((graph, init, key))
     own = (graph.num_poses, graph.num_edges)
-    num_poses, num_edges = (
-        rounded_up(n, k * _LEAST, 2) for n, k in zip(own, (1, 2), strict=True)
-    )
+    # A program takes as long to compile as it runs for in tens of calls.
+    an_octave = 1 if graph.num_poses <= DENSE_LIMIT else 2
+    num_poses = rounded_up(graph.num_poses, _LEAST, an_octave)
+    num_edges = rounded_up(graph.num_edges, 2 * num_poses, an_octave)
     if (num_poses, num_edges) == own or not all(map(_is_held, arrays)):
         return average_graph(graph, method, init, key)
     padded = dataclasses.replace(graph, num_poses=num_poses)

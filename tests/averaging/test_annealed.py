@@ -30,6 +30,13 @@ def _end(mark: float) -> Iterated:
     )
 
 
+def _before(stage: int) -> annealed._Descended:
+    low, start = jnp.asarray(-1.0), _end(1.0)
+    known = annealed._Start(low, start.trust, start.T_world_i, low, start.width)
+    least = jnp.asarray(10.0)
+    return annealed._Descended(jnp.asarray(stage), least, known, start, low)
+
+
 @pytest.mark.parametrize(
     ("stage", "log_ratio", "next_stage", "kept"),
     [
@@ -44,16 +51,38 @@ def _end(mark: float) -> Iterated:
 def test_a_descent_that_loses_likelihood_is_followed_by_another(
     stage, log_ratio, next_stage, kept
 ):
-    before = annealed._Descended(
-        jnp.asarray(stage, jnp.int32), jnp.asarray(10.0), _end(1.0)
-    )
+    before = _before(stage)
     told = Explained(jnp.asarray(log_ratio), jnp.asarray(0.1), jnp.zeros(1))
-    after = before.followed_by(_end(2.0), told)
+    after = before.followed_by(_end(2.0), told, told)
     assert int(after.stage) == next_stage
     np.testing.assert_array_equal(after.end.trust, [kept])
     np.testing.assert_array_equal(after.end.width, [kept, kept])
     opening = stage < SETTLING
     assert int(after.end.num_steps) == (1 if opening or kept == 1 else 2)
+
+
+def _told(log_ratio: float, deviation: float) -> Explained:
+    return Explained(jnp.asarray(log_ratio), jnp.asarray(deviation), jnp.zeros(1))
+
+
+@pytest.mark.parametrize(("plain", "kept"), [(6.0, 2.0), (4.0, 1.0)])
+def test_kernels_narrow_from_the_likelier_of_the_start_and_plain_steps(plain, kept):
+    # Edges do not count here: nothing is expected to be lost by chance.
+    nothing = _told(5.0, 0.1)._replace(log_odds=jnp.full(1, -jnp.inf))
+    alone, scale = _told(1.0, 0.25), jnp.asarray(2.0)
+    first = _before(annealed._JUDGING).judged(_end(1.0), nothing, alone, scale)
+    assert int(first.stage) == annealed._PLAIN
+    then = nothing._replace(log_ratio=jnp.asarray(plain))
+    after = first.judged(_end(2.0), then, _told(9.0, 0.5), scale)
+    assert int(after.stage) == 0
+    np.testing.assert_array_equal(after.start.T_world_i, np.full((2, 4, 4), kept))
+    assert float(after.least) == max(plain, 5.0)
+    # Three deviations and half an octave, of the poses that are kept.
+    width = 3 * 2**0.5 * (0.25 if kept == 1 else 0.5)
+    np.testing.assert_allclose(after.start.width, [2 * width, width], rtol=1e-6)
+    # Of the start itself, whichever is kept.
+    assert float(after.start.evidence) == 1
+    np.testing.assert_array_equal(after.start.right, [0.5])
 
 
 def test_few_right_closures_of_a_short_path_are_trusted():

@@ -197,8 +197,10 @@ def test_the_next_width_is_solved_from_the_mean_square_inside_the_present_one(
     T[:, :3, 3] += width[0] * off * shift
     graph = PoseGraph.from_edges(edges, T.astype(np.float32), 15)
     poses = jnp.asarray(X, jnp.float32)
-    begin, annealing = jnp.asarray(width, jnp.float32), jnp.asarray(False)
-    found = width_rule(jnp.asarray(1.0), begin, annealing)(graph, poses, begin)
+    begin, no = jnp.asarray(width, jnp.float32), jnp.asarray(False)
+    held = width_rule(jnp.asarray(1.0), begin, no, ~no)(graph, poses, begin)
+    np.testing.assert_array_equal(held, begin)
+    found = width_rule(jnp.asarray(1.0), begin, no, no)(graph, poses, begin)
     # Gaussian weights: each kind of error at one width, so exp(-1/2) of either.
     trust = np.exp(-1.0)
     count = exact + (num - exact) * trust

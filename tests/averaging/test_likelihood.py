@@ -155,9 +155,9 @@ def test_the_likeliest_deviation_and_the_odds_are_those_of_right_edges():
 def test_of_the_agreed_edges_those_of_a_tree_do_not_count():
     X, edges, T, bad = random_graph(32, 200, 0.3, 0)
     graph, true = single(edges, T, 32), jnp.asarray(X, jnp.float32)
-    share = Likelihood.of(graph).agreed_share(true)
-    assert share == pytest.approx((np.sum(~bad) - 31) / (200 - 31), abs=1e-6)
     found = explained(graph, true)
+    share = Likelihood.of(graph).agreed_share(found)
+    assert share == pytest.approx((np.sum(~bad) - 31) / (200 - 31), abs=1e-6)
     # Terms r^2 / (2 s^2) of right edges have the variance D / 2; each is right nearly
     # for sure.
     chance = np.sqrt(0.8 / 2 * np.sum(~bad))

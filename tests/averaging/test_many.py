@@ -58,7 +58,7 @@ def test_a_hundred_sizes_compile_once_a_bucket_and_settings_never():
 
 
 def test_single_graphs_of_similar_sizes_share_programs_and_keep_their_answers():
-    # 12 poses and 24 edges.
+    # 16 poses and 32 edges.
     graphs = _graphs([(12, 24), (9, 17), (10, 22), (11, 20)], outliers=0.0)
     starts = [_some_way_off(*n) for n in enumerate((12, 9, 10, 11))]
     jr.average(graphs[0], PLAIN, starts[0])
@@ -79,6 +79,16 @@ def test_single_graphs_of_similar_sizes_share_programs_and_keep_their_answers():
         assert alone.trace is not None
         steps = sol.trace.change[:2], alone.trace.change[:2]
         np.testing.assert_allclose(*steps, rtol=1e-3, atol=1e-6)
+
+
+def test_six_single_graphs_of_two_octaves_compile_three_times():
+    # To 32, 64 and 128 poses.
+    sizes = [(20, 29), (30, 44), (45, 67), (60, 89), (80, 119), (100, 149)]
+    graphs = _graphs(sizes, outliers=0.0, d=2)
+    with compiled() as names:
+        for graph in graphs:
+            assert jr.average(graph, PLAIN).status == Status.CONVERGED
+    assert len([name for name in names if "solve" in name]) == 3
 
 
 def _some_way_off(seed: int, num: int) -> jax.Array:

@@ -16,11 +16,13 @@ from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.likelihood import Likelihood
-from jaxreg.averaging.methods.annealed import annealed, better_start, or_start
+from jaxreg.averaging.methods.annealed import annealed
 from jaxreg.averaging.methods.graduated import graduated
+from jaxreg.averaging.methods.motion_averaging import iterate_plain
 from jaxreg.averaging.start.closures import without_doubtful_closures
 from jaxreg.averaging.start.cycle_consensus import CycleConsensus
 from jaxreg.averaging.steps.iterate import solution_of
+from jaxreg.averaging.steps.rows import RootRows
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.graph.trees import along_frames
 from jaxreg.linear.laplacian import DENSE_LIMIT
@@ -80,8 +82,10 @@ class Correntropy(AbstractAverager):
         self, graph: PoseGraph, T_start: Float[Array, "v D D"]
     ) -> AveragingSolution:
         likelihood = Likelihood.of(graph)
-        end = annealed(graph, likelihood, T_start, self.max_steps, self.tolerance)
-        return or_start(graph, likelihood, end, T_start)
+        end, evidence = annealed(
+            graph, likelihood, T_start, self.max_steps, self.tolerance
+        )
+        return solution_of(graph, end, likelihood, evidence)
 
     @kept_program
     def _large(
@@ -91,11 +95,26 @@ class Correntropy(AbstractAverager):
         likelihood = Likelihood.of(graph)
         if init is None:
             T_start = starting_poses(self.initialiser, near, None, key)
-            better, _ = better_start(likelihood, T_start, near)
+            better = _better_start(likelihood, T_start, near)
             starts = [better, along_frames(graph)]
         else:
             # A start of the caller's may be far off: plain steps that leave out what
             # pulls against them would bend it for good.
-            starts = [better_start(likelihood, init, graph)[0]]
+            starts = [_better_start(likelihood, init, graph)]
         end = graduated(graph, likelihood, near, jnp.stack(starts), self.max_steps)
         return solution_of(graph, end, likelihood)
+
+
+def _better_start(
+    likelihood: Likelihood, T_start: Float[Array, "v D D"], near: PoseGraph
+) -> Float[Array, "v D D"]:
+    """The start, or what a few plain steps make of it if that is likelier.
+
+    A chain of good edges drifts: its loop closures then look wrong, and a redescending
+    kernel would drop them. Plain averaging spreads the drift; with wrong edges about,
+    it agrees with few, and the start stands. The steps have the weights of `near`.
+    """
+    plain = iterate_plain(near, T_start, RootRows(), max_steps=5, tolerance=1e-2)
+    both = jnp.stack([T_start, plain.T_world_i])
+    found = jax.lax.map(lambda T: likelihood.explained(T).log_ratio, both)
+    return both[jnp.where(found[1] > found[0], 1, 0)]

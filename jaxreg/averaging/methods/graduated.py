@@ -309,10 +309,10 @@ class _Attempts(AbstractIteration[Array, _Best]):
         better = score > b.score
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), end, b.end)
         trusted = jnp.where(narrowing.trusted, graph.weight, 0)
-        trusted = eqx.tree_at(lambda g: g.weight, graph, trusted)
+        among = Likelihood.of(eqx.tree_at(lambda g: g.weight, graph, trusted))
         return _Best(
             end=best._replace(found=best.found._replace(step=steps)),
             score=jnp.maximum(score, b.score),
             num_steps=b.num_steps + 1,
-            settled=Likelihood.of(trusted).agreed_share(end.found.T) > SETTLED,
+            settled=among.agreed_share(among.explained(end.found.T)) > SETTLED,
         )

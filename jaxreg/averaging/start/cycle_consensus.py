@@ -125,14 +125,14 @@ class _Search(AbstractIteration[Key | None, _Best]):
         weights = jnp.concatenate([odds, graph.weight[None]])
         T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(weights)
         T = jnp.concatenate([T, _shortest(graph, odds)[None]])
-        best, found = _likeliest(Likelihood.of(graph), T)
+        chosen = _chosen(graph, odds, T)
         none = jnp.asarray(0, jnp.int32)
         return _Best(
-            T=T[best],
-            found=found,
+            T=T[chosen.best],
+            found=chosen.found,
             odds=odds,
-            scale=jnp.minimum(best, len(odds) - 1),
-            settled=_is_settled(graph, odds, T[best]),
+            scale=jnp.minimum(chosen.best, len(odds) - 1),
+            settled=chosen.settled,
             idle=none,
             num_steps=none,
             key=jax.random.key(0) if start is None else start,
@@ -161,12 +161,14 @@ class _Search(AbstractIteration[Key | None, _Best]):
         T = jax.vmap(lambda o: _forest(graph, o).T_world_i)(each)
         T = jnp.concatenate([best.T[None], T])
         if graph.num_poses <= DENSE_LIMIT:
-            T = jax.vmap(lambda T: settled(likelihood, T))(T)
-        likeliest, found = _likeliest(likelihood, T)
-        better = found.log_ratio > best.found.log_ratio
+            T, found = jax.vmap(lambda T: settled(likelihood, T))(T)
+        else:
+            found = _explained(likelihood, T)
+        likeliest = jnp.argmax(found.log_ratio)
+        better = found.log_ratio[likeliest] > best.found.log_ratio
         T_best, found = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old),
-            (T[likeliest], found),
+            lambda new, old: jnp.where(better, new[likeliest], old),
+            (T, found),
             (best.T, best.found),
         )
         return best._replace(
@@ -199,7 +201,7 @@ def _by_trees(graph: PoseGraph) -> Float[Array, "v D D"]:
             trees.maximum_spanning_tree(*args).T_world_i,
         ]
     )
-    return T[_likeliest(Likelihood.of(graph), T)[0]]
+    return T[jnp.argmax(_explained(Likelihood.of(graph), T).log_ratio)]
 
 
 @kept_program
@@ -218,15 +220,11 @@ def _with_trust(graph: PoseGraph, best: _Best) -> AveragingSolution:
     return solution(graph, best.T, edge_weight=trust, num_steps=best.num_steps)
 
 
-def _likeliest(
-    likelihood: Likelihood, T: Float[Array, "m v D D"]
-) -> tuple[Int[Array, ""], Explained]:
-    """Which of some poses, and how they explain the motions."""
+def _explained(likelihood: Likelihood, T: Float[Array, "m v D D"]) -> Explained:
+    """How each of some poses explains the motions."""
     # Groups of one size: what is left over would be a program of its own.
     group = max(k for k in range(1, _GROUP + 1) if len(T) % k == 0)
-    found = jax.lax.map(likelihood.explained, T, batch_size=group)
-    best = jnp.argmax(found.log_ratio)
-    return best, jax.tree.map(lambda x: x[best], found)
+    return jax.lax.map(likelihood.explained, T, batch_size=group)
 
 
 def _forest(graph: PoseGraph, odds: Array) -> trees.Forest:
@@ -246,24 +244,62 @@ def _shortest(graph: PoseGraph, odds: Array) -> Array:
     return shortest_paths(graph.edges, graph.T_i_j, weight, graph.num_poses).T_root_i
 
 
-def _is_settled(graph: PoseGraph, odds: Array, T: Array) -> Array:
-    """True if trusted edges reach every frame and hardly any contradicts the poses.
+class _Chosen(NamedTuple):
+    """Of some poses.
 
-    The edges trusted at any one scale: noise may leave few at the finest. The first
-    scale answers as a rule, so one is asked after another.
+    Attributes:
+        num_judged: poses, then scales by which the best of them are judged.
+        best: the likeliest.
+        found: how they explain the motions.
+        placed: `(v,)` which frames edges join to frame 0.
+        settled: whether trusted edges reach every such frame, and hardly any of them
+            contradicts the poses.
     """
-    placed = trees.components(graph.edges, graph.weight, graph.num_poses) == 0
 
-    def at_next_scale(asked: tuple[Array, Array]) -> tuple[Array, Array]:
-        scale, _ = asked
-        trusted = jnp.where(odds[scale] > 0, graph.weight, 0)
-        component = trees.components(graph.edges, trusted, graph.num_poses)
-        reached = jnp.all((component == 0) | ~placed)
-        part = eqx.tree_at(lambda g: g.weight, graph, trusted)
-        return scale + 1, reached & (Likelihood.of(part).agreed_share(T) > SETTLED)
+    num_judged: Int[Array, ""]
+    best: Int[Array, ""]
+    found: Explained
+    placed: Bool[Array, " v"]
+    settled: Bool[Array, ""]
 
+
+def _chosen(
+    graph: PoseGraph, odds: Float[Array, "s e"], T: Float[Array, "m v D D"]
+) -> _Chosen:
+    """The likeliest of some poses, and whether they need no search.
+
+    All edges judge the poses one after another, and those that are trusted at a scale
+    the best: noise may leave few at the finest, and the first answers as a rule. All in
+    one loop, as what judges takes long to compile.
+    """
+    weight, num = graph.weight, len(T)
+    trusted = jnp.where(odds > 0, weight[None], 0)
+
+    def judge(so_far: _Chosen) -> _Chosen:
+        k, best = so_far.num_judged, so_far.best
+        is_poses = k < num
+        by = jnp.where(is_poses, weight, trusted[jnp.maximum(k - num, 0)])
+        likelihood = Likelihood.of(eqx.tree_at(lambda g: g.weight, graph, by))
+        told = likelihood.explained(T[jnp.where(is_poses, k, best)])
+        first, joined = k == 0, trees.components(graph.edges, by, graph.num_poses) == 0
+        placed = jnp.where(first, joined, so_far.placed)
+        better = first | (is_poses & (told.log_ratio > so_far.found.log_ratio))
+        agree = likelihood.agreed_share(told) > SETTLED
+        return _Chosen(
+            num_judged=k + 1,
+            best=jnp.where(better, k, best),
+            found=jax.tree.map(
+                lambda new, old: jnp.where(better, new, old), told, so_far.found
+            ),
+            placed=placed,
+            settled=~is_poses & agree & jnp.all(joined | ~placed),
+        )
+
+    none, zero = jnp.asarray(0, jnp.int32), jnp.zeros((), weight.dtype)
+    nothing = Explained(zero, zero, jnp.zeros_like(weight))
+    no_frames = jnp.zeros(graph.num_poses, bool)
     return control.while_loop(
-        lambda asked: ~asked[1] & (asked[0] < len(odds)),
-        at_next_scale,
-        (jnp.asarray(0, jnp.int32), jnp.asarray(False)),
-    )[1]
+        lambda s: ~s.settled & (s.num_judged < num + len(odds)),
+        judge,
+        _Chosen(none, none, nothing, no_frames, jnp.asarray(False)),
+    )

@@ -125,20 +125,28 @@ def iterate(
     *,
     max_steps: int,
     tolerance: Array | float,
+    at_most: Int[Array, ""] | None = None,
 ) -> Iterated:
     """Alternates weights and steps until widths and poses stand still.
 
     Stops when no rotation moves by more than `tolerance` radians, no position by more
     than `tolerance` of the size of the scene, and no width shrinks by more than
-    a thousandth of itself, or after `max_steps`. Nothing is differentiable here; the
-    caller attaches the derivatives of the fixed point.
+    a thousandth of itself, or after `max_steps` or as few as `at_most`. Nothing is
+    differentiable here; the caller attaches the derivatives of the fixed point.
     """
     graph, T_start, width_start, tolerance = jax.lax.stop_gradient(
         (graph, T_start, width_start, tolerance)
     )
     limit = jnp.maximum(tolerance, 32 * jnp.finfo(T_start.dtype).eps)
     averaging = _Averaging(
-        graph, graph.length_scale, limit, width_of, trust_of, step_of, max_steps
+        graph,
+        graph.length_scale,
+        limit,
+        width_of,
+        trust_of,
+        step_of,
+        max_steps,
+        jnp.asarray(max_steps if at_most is None else at_most),
     )
     begin = averaging.init((T_start, width_start))
     ended = loop.iterate(averaging, begin, max_steps=max_steps)
@@ -166,6 +174,7 @@ class _Averaging(loop.AbstractIteration[tuple[Array, Array], _State]):
     trust_of: TrustOf
     step_of: Step
     max_steps: int
+    at_most: Int[Array, ""]
 
     def init(self, start: tuple[Array, Array]) -> _State:
         T, width = start
@@ -181,7 +190,7 @@ class _Averaging(loop.AbstractIteration[tuple[Array, Array], _State]):
         return state.change <= self.limit
 
     def fail(self, state: _State) -> Bool[Array, ""]:
-        return jnp.isnan(state.change)
+        return jnp.isnan(state.change) | (state.num_steps >= self.at_most)
 
     def step(self, state: _State) -> _State:
         graph, before = self.graph, state.width

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.chi_squared import exceeded_with
 from jaxreg._core.quantile import nearest_rank
-from jaxreg.averaging.likelihood import Likelihood
+from jaxreg.averaging.likelihood import Explained
 from jaxreg.averaging.steps.iterate import STILL, WidthOf
 from jaxreg.graph.pose_graph import PoseGraph
 from jaxreg.linear.small import inverse
@@ -34,33 +34,37 @@ def _gaussian(differences: tuple[Array, Array], width: Array) -> Array:
     return jnp.exp(-sq / 2)
 
 
-def first_width(
-    likelihood: Likelihood, T_world_i: Float[Array, "v D D"]
-) -> Float[Array, "2"]:
-    """A width that sees the right edges from the start, and few others.
+def first_width(alone: Explained, scale: Float[Array, ""]) -> Float[Array, "2"]:
+    """A width that sees the right edges from poses, and few others.
 
     Three of the likeliest deviations, and half of the octave between those compared.
+
+    Args:
+        alone: how the poses explain the motions where each wrong one is alone.
+        scale: the graph's `length_scale`.
     """
-    deviation = likelihood.explained(T_world_i, alone=True).deviation
-    width = KERNEL_DEVIATIONS * 2**0.5 * deviation
-    return jnp.stack([width * likelihood.scale, width])
+    width = KERNEL_DEVIATIONS * 2**0.5 * alone.deviation
+    return jnp.stack([width * scale, width])
 
 
 def width_rule(
-    scale: Float[Array, ""], begin: Float[Array, "2"], settling: Bool[Array, ""]
+    scale: Float[Array, ""],
+    begin: Float[Array, "2"],
+    settling: Bool[Array, ""],
+    held: Bool[Array, ""],
 ) -> WidthOf:
     """The next width: three deviations of the edges inside the present one.
 
     While annealing never wider than before, nor narrower than half of it; while
-    settling near `begin`, so that it ends as three deviations inside itself. `scale` is
-    the `length_scale` of the graph.
+    settling near `begin`, so that it ends as three deviations inside itself; `begin` if
+    it is held. `scale` is the `length_scale` of the graph.
     """
 
     def width_of(graph: PoseGraph, T: Array, width: Array) -> Array:
         target = _three_deviations(graph, T, width, scale)
         least = jnp.where(settling, begin / _NEAR, width / 2)
         most = jnp.where(settling, begin * _NEAR, width)
-        return jnp.clip(target, least, most)
+        return jnp.where(held, begin, jnp.clip(target, least, most))
 
     return width_of
 
