@@ -1,4 +1,5 @@
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from scipy.special import logsumexp
 
 import jaxreg as jr
 from jaxreg import Status
-from jaxreg.averaging import MotionAveraging, average
+from jaxreg.averaging import CycleConsensus, MotionAveraging, average
 from jaxreg.averaging.likelihood import Likelihood, least_after_fitting
 from jaxreg.graph import PoseGraph
 from tests.averaging.graphs import (
@@ -212,6 +213,12 @@ def test_where_nothing_agrees_the_status_says_so():
     assert found.status == Status.NO_AGREEMENT
     assert found.log_evidence <= 0
     assert "agree" in Status.NO_AGREEMENT.advice
+    # Poses are those of the start, trust how probable edges are if it is right.
+    start = average(single(edges, wild, N), CycleConsensus()).T_world_i
+    np.testing.assert_allclose(found.T_world_i, start, atol=1e-5)
+    graph = single(edges, wild, N)
+    odds = Likelihood.of(graph).explained(start, alone=True).log_odds
+    np.testing.assert_allclose(found.edge_weight, jax.nn.sigmoid(odds), atol=1e-3)
     # A tree has no edge to spare.
     edges[: N - 1] = np.stack([np.arange(N - 1), np.arange(1, N)], axis=1)
     chain = single(edges, wild, N, mask=np.arange(H) < N - 1)
