@@ -22,9 +22,10 @@ def near_ways(
 ) -> tuple[Bool[Array, "t e"], Bool[Array, "l t"]]:
     """Whether an edge is near in each way, and which ways each law may mean.
 
-    A law (see `Likelihood`) is told by whether its wrong motions are alone. Successive numbers say what is near if most edges are the steps of a sequence. Of
-    more than `DENSE_LIMIT` frames drift tells false closures, and this would count it
-    against right ones: a path that nothing bends holds all its steps exactly.
+    A law (see `Likelihood`) is told by whether its wrong motions are alone. Successive
+    numbers say what is near if most edges are the steps of a sequence. Of more than
+    `DENSE_LIMIT` frames drift tells false closures, and this would count it against
+    right ones: a path that nothing bends holds all its steps exactly.
     """
     near = _among_nearest(graph, T_i_j, scale)
     meant = jnp.ones((len(laws), len(near)), bool)

@@ -120,6 +120,20 @@ def test_settled_graphs_need_no_hypotheses():
         CycleConsensus(hypotheses=0)
 
 
+def test_a_search_ends_where_many_trees_meet():
+    for seed in range(2):
+        X, edges, T, _ = random_graph(24, 100, 0.2, seed)
+        graph = PoseGraph.from_edges(edges, T.astype(np.float32), 24)
+        found = average(graph, CycleConsensus())
+        assert 0 < found.num_steps < 8
+        truth = jnp.asarray(X, jnp.float32)
+        assert rotation_error(found.T_world_i, truth, "best") < 0.1
+    # Where nothing agrees it goes on until half of its rounds have gained nothing.
+    wild = T[np.random.default_rng(0).permutation(len(T))].astype(np.float32)
+    found = average(PoseGraph.from_edges(edges, wild, 24), CycleConsensus())
+    assert found.num_steps >= 8
+
+
 def test_noise_alone_is_not_taken_for_outliers():
     X, edges, T = noisy_grid(4, 0)
     graph = PoseGraph.from_edges(edges, T.astype(np.float32))
