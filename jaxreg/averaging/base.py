@@ -133,7 +133,10 @@ def solution(
     likelihood: Likelihood | None = None,
     evidence: Float[Array, ""] | None = None,
 ) -> AveragingSolution:
-    """Fills in what is the same for every method; the last two where they are known."""
+    """Fills in what is the same for every method; the last two where they are known.
+
+    Whether anything agrees at all is judged by `average`, after the method.
+    """
     dtype = T_world_i.dtype
     likelihood = Likelihood.of(graph) if likelihood is None else likelihood
     scale = likelihood.scale

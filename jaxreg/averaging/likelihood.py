@@ -192,7 +192,9 @@ class Likelihood(eqx.Module):
         T_i_j = self.graph.predicted(T_world_i)
         sq = squared_errors(self.graph, T_i_j, self.scale)
         near, meant = near_ways(self.graph, T_i_j, self.scale, laws)
-        return _Seen(sq, near), meant
+        prior = jnp.asarray(_LOG_ODDS, sq.dtype)[:, None] + self.prior_odds[None]
+        sides = jnp.concatenate([near, ~near]).astype(sq.dtype)
+        return _Seen(sq, near, sides, prior, jax.nn.softplus(prior)), meant
 
     def _log_gain(
         self, sq: Array, dimension: Array, deviation: Array
@@ -205,13 +207,10 @@ class Likelihood(eqx.Module):
         self, seen: "_Seen", dimension: Array, deviation: Array, meant: Array
     ) -> Float[Array, "near far t"]:
         """The terms of log Lambda of one deviation."""
-        sq, near_ways = seen
-        prior = jnp.asarray(_LOG_ODDS, sq.dtype)[:, None] + self.prior_odds[None]
-        gain, most = self._log_gain(sq, dimension, deviation)
-        each = jax.nn.softplus(prior + gain[None]) - jax.nn.softplus(prior)
+        gain, most = self._log_gain(seen.sq, dimension, deviation)
+        each = jax.nn.softplus(seen.prior + gain[None]) - seen.none
         each = jnp.where(self.graph.weight[None] > 0, each, 0)
-        both_sides = jnp.concatenate([near_ways, ~near_ways]).astype(sq.dtype)
-        sums = jnp.matmul(each, both_sides.T, precision=jax.lax.Precision.HIGHEST)
+        sums = jnp.matmul(each, seen.sides.T, precision=jax.lax.Precision.HIGHEST)
         near, far = jnp.split(sums, 2, axis=1)
         both = near[:, None] + far[None]
         may = jnp.asarray(_ALLOWED)[..., None] & meant[None, None]
@@ -221,25 +220,34 @@ class Likelihood(eqx.Module):
         self, seen: "_Seen", every: Array, dimension: Array, count: Array
     ) -> Explained:
         """From the terms of a law."""
-        sq, near_ways = seen
-        ladder = jnp.asarray(DEVIATIONS, sq.dtype)
-        log_odds = jnp.asarray(_LOG_ODDS, sq.dtype)
+        ladder = jnp.asarray(DEVIATIONS, seen.sq.dtype)
         s, near, far, t = _places(every.shape)[:, jnp.argmax(every)]
-        p = jnp.where(near_ways[t], log_odds[near], log_odds[far])
-        gain, _ = self._log_gain(sq, dimension, ladder[s])
-        ratio = jax.nn.logsumexp(every) - jnp.log(count.astype(sq.dtype))
+        right = jnp.where(seen.near[t], seen.prior[near], seen.prior[far])
+        gain, _ = self._log_gain(seen.sq, dimension, ladder[s])
+        ratio = jax.nn.logsumexp(every) - jnp.log(count.astype(ladder.dtype))
         return Explained(
             jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf),
             ladder[s],
-            jnp.where(self.graph.weight > 0, p + self.prior_odds + gain, -jnp.inf),
+            jnp.where(self.graph.weight > 0, right + gain, -jnp.inf),
         )
 
 
 class _Seen(NamedTuple):
-    """What poses make of the motions of a graph."""
+    """What poses make of the motions of a graph, and all that deviations share.
 
-    sq: Float[Array, " e"]  # `squared_errors`
-    near: Bool[Array, "t e"]  # in each way
+    Attributes:
+        sq: `squared_errors`.
+        near: which edges are near in each way.
+        sides: those, and those that are far in each way, as numbers.
+        prior: log odds of each edge for each p.
+        none: the logarithm of 1 plus those odds.
+    """
+
+    sq: Float[Array, " e"]
+    near: Bool[Array, "t e"]
+    sides: Float[Array, "s e"]
+    prior: Float[Array, "p e"]
+    none: Float[Array, "p e"]
 
 
 def least_after_fitting(found: Explained) -> Float[Array, ""]:

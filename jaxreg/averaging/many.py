@@ -65,10 +65,13 @@ def average_rounded(
     """`average_graph`, by a program that graphs of similar sizes share."""
     arrays = jax.tree.leaves((graph, init, key))
     own = (graph.num_poses, graph.num_edges)
-    # A program takes as long to compile as it runs for in tens of calls.
-    an_octave = 1 if graph.num_poses <= DENSE_LIMIT else 2
+    # Small ones compile for as long as they run in tens of calls; of large ones each
+    # row that is added costs.
+    small = graph.num_poses <= DENSE_LIMIT
+    an_octave = 1 if small else 2
     num_poses = rounded_up(graph.num_poses, _LEAST, an_octave)
-    num_edges = rounded_up(graph.num_edges, 2 * num_poses, an_octave)
+    least = 2 * (num_poses if small else _LEAST)
+    num_edges = rounded_up(graph.num_edges, least, an_octave)
     if (num_poses, num_edges) == own or not all(map(_is_held, arrays)):
         return average_graph(graph, method, init, key)
     padded = dataclasses.replace(graph, num_poses=num_poses)

@@ -26,7 +26,7 @@ def rounded_up(num_rows: int, least: int = _LEAST, an_octave: int = 4) -> int:
 
     `least` is the first of them, a power of two of at least 4. Four sizes an octave, so
     that few programs compile: a quarter more rows at most, a ninth on average. With two
-    half more at most, a fifth on average.
+    half more at most, a fifth on average; with one twice as many at most.
     """
     if num_rows <= least:
         return least

@@ -30,6 +30,10 @@ def _end(mark: float) -> Iterated:
     )
 
 
+def _told(log_ratio: float, deviation: float) -> Explained:
+    return Explained(jnp.asarray(log_ratio), jnp.asarray(deviation), jnp.zeros(1))
+
+
 def _before(stage: int) -> annealed._Descended:
     low, start = jnp.asarray(-1.0), _end(1.0)
     known = annealed._Start(low, start.trust, start.T_world_i, low, start.width)
@@ -52,17 +56,13 @@ def test_a_descent_that_loses_likelihood_is_followed_by_another(
     stage, log_ratio, next_stage, kept
 ):
     before = _before(stage)
-    told = Explained(jnp.asarray(log_ratio), jnp.asarray(0.1), jnp.zeros(1))
+    told = _told(log_ratio, 0.1)
     after = before.followed_by(_end(2.0), told, told)
     assert int(after.stage) == next_stage
     np.testing.assert_array_equal(after.end.trust, [kept])
     np.testing.assert_array_equal(after.end.width, [kept, kept])
     opening = stage < SETTLING
     assert int(after.end.num_steps) == (1 if opening or kept == 1 else 2)
-
-
-def _told(log_ratio: float, deviation: float) -> Explained:
-    return Explained(jnp.asarray(log_ratio), jnp.asarray(deviation), jnp.zeros(1))
 
 
 @pytest.mark.parametrize(("plain", "kept"), [(6.0, 2.0), (4.0, 1.0)])
