@@ -21,6 +21,7 @@ from jaxtyping import Array
 
 Tree = TypeVar("Tree")
 Args = ParamSpec("Args")
+In = TypeVar("In")
 Out = TypeVar("Out")
 
 #: The axes over which the inputs of the function that is traced vary, if it told them.
@@ -77,6 +78,16 @@ def fori_loop(
     if not _manual_axes():
         return lax.fori_loop(lower, upper, body, start, **how)
     return lax.fori_loop(lower, upper, _typed(body), varying(start), **how)
+
+
+def grouped_map(function: Callable[[In], Out], rows: In, most: int) -> Out:
+    """`jax.lax.map`, so many rows side by side as divide all, at most `most`.
+
+    Groups of one size: what is left over would be a program of its own.
+    """
+    num = len(jax.tree.leaves(rows)[0])
+    group = max(k for k in range(1, most + 1) if num % k == 0)
+    return lax.map(function, rows, batch_size=group)
 
 
 def scan(

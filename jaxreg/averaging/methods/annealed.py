@@ -37,7 +37,7 @@ from jaxreg.graph.pose_graph import PoseGraph
 # Radians, and shares of the scene: so near annealing ends; settled widths do the rest.
 _NEARLY = 1e-3
 # Steps without a kernel, and how near they end: enough to tell which way is likelier.
-_PLAIN_STEPS, _PLAIN_NEARLY = 5, 1e-2
+_PLAIN_STEPS, _PLAIN_NEARLY = 3, 1e-2
 # So many scenes and radians wide every edge counts fully.
 _NO_KERNEL = 1e6
 # What comes before and after the descents from ever narrower kernels, 0, 1, ...
