@@ -2,7 +2,7 @@
 
 import atexit
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 
@@ -12,7 +12,7 @@ from bench.case import Case, Method, Options
 from bench.peers.local_settings import peers, solve_many
 from bench.timing import num_cores
 from bench.workloads.local_data import accuracy, draw, load
-from bench.workloads.local_pairs import own_methods
+from bench.workloads.local_pairs import own_methods, pose_alone
 
 
 PAIRS, POINTS = 64, 2_000
@@ -36,6 +36,7 @@ def cases(options: Options) -> Iterator[Case]:
         methods.append(
             Method(name, "jaxreg", method.parameters, solve, on_accelerator=True)
         )
+    methods.append(_poses_alone(cores, sources, targets))
     pool = ProcessPoolExecutor(cores, mp_context=get_context("spawn"))
     atexit.register(pool.shutdown)
     for peer, *_ in peers():
@@ -63,6 +64,29 @@ def cases(options: Options) -> Iterator[Case]:
         items=PAIRS,
         item="pairs",
     )
+
+
+def _poses_alone(cores: int, sources: np.ndarray, targets: np.ndarray) -> Method:
+    """A `jit` of the caller's that keeps the poses, which is what peers tell.
+
+    A thread of the caller's for each core: in a `jit` a batch goes through one core.
+    """
+    alone = pose_alone()
+    threads = ThreadPoolExecutor(cores)
+    atexit.register(threads.shutdown)
+
+    def some(at: int) -> np.ndarray:
+        assert alone.solve is not None
+        return alone.solve(sources[at::cores], targets[at::cores], 0.0)
+
+    def every() -> np.ndarray:
+        poses = np.empty((len(sources), 4, 4))
+        for at, found in enumerate(threads.map(some, range(cores))):
+            poses[at::cores] = found
+        return poses
+
+    name = f"{alone.name}, {cores} threads"
+    return Method(name, alone.library, alone.parameters, every)
 
 
 def _in_processes(
