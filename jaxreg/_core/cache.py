@@ -22,6 +22,9 @@ def cache(folder: str | Path | None = None) -> Path:
     installed (`jaxreg[app]` has it): then a call is neither traced nor compiled. Those
     of methods with parts of other code than this package are compiled ones only.
 
+    What a process asked for after its first program, the next one loads in threads as
+    soon as it asks for that one.
+
     Call it before the first program is compiled. It sets JAX's configuration for the
     whole process, and so nothing but a call of it does. Kept is what takes 50 ms or
     more to compile, unless `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` says otherwise.

@@ -61,11 +61,20 @@ def write(path: Path, exported: Any, skeleton: Any) -> None:
     except Exception:  # noqa: BLE001  whatever objects and JAX raise: not kept then
         return
     body = len(parts[0]).to_bytes(8, "little") + b"".join(parts)
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     _make_room(path.parent, len(body))
+    replace(path, _MAGIC + hashlib.sha256(body).digest() + body)
+
+
+def replace(path: Path, content: bytes) -> None:
+    """Writes a file beside another and puts it in its place.
+
+    Raises:
+        OSError: if the folder takes nothing.
+    """
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
         try:
-            file.write(_MAGIC + hashlib.sha256(body).digest() + body)
+            file.write(content)
             file.close()
             os.replace(file.name, path)
         except BaseException:
@@ -105,6 +114,7 @@ def _make_room(folder: Path, num_bytes: int) -> None:
         if total <= _MOST_BYTES:
             break
         path.unlink(missing_ok=True)
+        path.with_suffix(".then").unlink(missing_ok=True)
         total -= size
 
 

@@ -53,6 +53,11 @@ def make_room() -> None:
         )
 
 
+def has_room() -> bool:
+    """Whether there is room for programs that may be needed, beside one that is."""
+    return share_used() < _MOST / 2
+
+
 def share_used() -> float:
     """Of the maps that this process may have; zero where that is not told."""
     try:

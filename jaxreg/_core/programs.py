@@ -23,6 +23,7 @@ from jaxreg._core.checks import is_concrete
 from jaxreg._core.platforms import platform_of, traced_for
 from jaxreg._core.program_files import Hole, digest, pickled, read, write
 from jaxreg._core.program_room import make_room
+from jaxreg._core.programs_ahead import ProgramsAhead
 
 
 P = ParamSpec("P")
@@ -83,9 +84,20 @@ def _as_it_is_traced(function: Callable[..., Out]) -> Callable[..., Out]:
 class _Program(NamedTuple):
     """A traced program, and what its answer looks like."""
 
-    run: Callable[..., Any]
+    run: Any  # what `jax.jit` makes
     skeleton: Any  # the answer with holes for arrays
     platform: str
+    takes: list[jax.ShapeDtypeStruct]
+
+    @classmethod
+    def of(cls, exported: Any, skeleton: Any) -> "_Program":
+        """From what a file has."""
+        takes = [
+            jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type)
+            for x in exported.in_avals
+        ]
+        run, (platform,) = jax.jit(exported.call), exported.platforms
+        return cls(run, skeleton, platform, takes)
 
     def __call__(self, args: Any, kwargs: Any) -> Any:
         given = jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array))
@@ -102,6 +114,8 @@ class _Store:
     def __init__(self, folder: Path):
         self.folder = folder
         self._met: dict[Any, _Program | None] = {}
+        self._ahead = ProgramsAhead(folder, self._compiled)
+        self._wide = False
         self._told = False
 
     def program(
@@ -143,15 +157,27 @@ class _Store:
             name = digest(pickled((*who, asked)), *settings, *_code())
         except Exception:  # noqa: BLE001  whatever the pickling of an object raises
             return None
-        path = self.folder / f"{name}.program"
-        found = read(path)
-        if found is None:
-            found = _exported(function, platform, args, kwargs)
-            if found is None:
-                return None
-            self._write(path, *found)
-        exported, skeleton = found
-        return _Program(jax.jit(exported.call), skeleton, platform)
+        self._wide = jnp.result_type(float) == jnp.float64
+        found = self._ahead.ask(name) or self._read(name)
+        if found is not None:
+            return found
+        made = _exported(function, platform, args, kwargs)
+        if made is None:
+            return None
+        self._write(self.folder / f"{name}.program", *made)
+        return _Program.of(*made)
+
+    def _read(self, name: str) -> _Program | None:
+        found = read(self.folder / f"{name}.program")
+        return None if found is None else _Program.of(*found)
+
+    def _compiled(self, name: str) -> _Program | None:
+        """From the folder, ready to run; in a thread, which has settings of its own."""
+        program = self._read(name)
+        if program is not None and program.platform == jax.default_backend():
+            with jax.enable_x64(self._wide):
+                program.run.lower(*program.takes).compile()
+        return program
 
     def _write(self, path: Path, exported: Any, skeleton: Any) -> None:
         """A folder that takes nothing is told of once."""
@@ -189,10 +215,24 @@ def _uncommitted(leaves: list[jax.Array]) -> list[jax.Array]:
     JAX commits what exported programs give; what is then given both ways is compiled
     twice. By NumPy nothing is copied on a CPU; 20 arrays take 0.4 ms.
     """
-    keys = any(jnp.issubdtype(x.dtype, jax.dtypes.prng_key) for x in leaves)
-    if keys or not all(map(is_concrete, leaves)):  # traced in a program of the user
+    if not all(map(is_concrete, leaves)):  # traced in a program of the user
         return leaves
-    return jax.device_put(list(map(np.asarray, leaves)))
+    kinds = [_kind_of_key(x) for x in leaves]
+    bare = [
+        x if kind is None else jax.random.key_data(x)
+        for x, kind in zip(leaves, kinds, strict=True)
+    ]
+    there = jax.device_put(list(map(np.asarray, bare)))
+    return [
+        x if kind is None else jax.random.wrap_key_data(x, impl=kind)
+        for x, kind in zip(there, kinds, strict=True)
+    ]
+
+
+def _kind_of_key(x: jax.Array) -> Any:
+    """Of random numbers that a key draws; None of other arrays."""
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return jax.random.key_impl(x) if is_key else None
 
 
 def _settings(platform: str) -> tuple[str, ...] | None:
