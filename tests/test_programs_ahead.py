@@ -11,7 +11,7 @@ import pytest
 from jaxreg._core import programs_ahead
 from jaxreg._core.program_files import digest
 from jaxreg._core.programs import keep_programs, kept_program
-from jaxreg._core.programs_ahead import ProgramsAhead
+from jaxreg._core.programs_ahead import THREAD, ProgramsAhead
 
 
 A, B, C, D, E = (digest(x) for x in "abcde")
@@ -43,7 +43,7 @@ class Loader:
 
 def _finished() -> None:
     for thread in threading.enumerate():
-        if thread.name == "jaxreg programs ahead":
+        if thread.name == THREAD:
             thread.join()
 
 
@@ -177,5 +177,5 @@ def test_a_program_that_was_loaded_ahead_runs_without_being_made_again(
         keep_programs(None)
         jax.monitoring.unregister_event_duration_listener(hear)
     assert not made
-    assert "jaxreg programs ahead" in compiled
+    assert THREAD in compiled
     np.testing.assert_array_equal(first, again)

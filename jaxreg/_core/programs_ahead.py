@@ -9,11 +9,14 @@ by the name of the command, while modules are imported, brought nothing.)
 import contextlib
 import re
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
+
+import jax
 
 from jaxreg._core.program_files import replace
 from jaxreg._core.program_room import has_room
@@ -24,6 +27,9 @@ _MOST = 64
 # The main thread waits for the first of them, as a rule.
 _THREADS = 2
 _NAME = re.compile("[0-9a-f]{40}")
+#: The name of threads that load, and an event of `jax.monitoring`: the seconds that the
+#: main thread waited for them.
+THREAD, WAITED = "jaxreg programs ahead", "/jaxreg/programs_ahead_waited_for"
 #: Loads the program of a name; None if it is not there.
 Load = Callable[[str], Any]
 
@@ -81,7 +87,7 @@ class _Loading:
         self._load = load
         for _ in range(_THREADS):
             # No daemon: Python must not be taken down while XLA works in a thread.
-            threading.Thread(target=self._run, name="jaxreg programs ahead").start()
+            threading.Thread(target=self._run, name=THREAD).start()
 
     def _run(self) -> None:
         while threading.main_thread().is_alive() and has_room():
@@ -104,7 +110,13 @@ class _Loading:
             future = self._begun.pop(name, None)
             if future is None and name in self._waiting:
                 self._waiting.remove(name)
-        return None if future is None else future.result()
+        if future is None:
+            return None
+        start = time.perf_counter()
+        found = future.result()
+        waited = time.perf_counter() - start
+        jax.monitoring.record_event_duration_secs(WAITED, waited)
+        return found
 
     def stop(self) -> None:
         """After the one that is being loaded."""

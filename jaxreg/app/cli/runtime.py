@@ -3,6 +3,7 @@
 import contextlib
 import re
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ from rich.progress import (
 )
 
 import jaxreg
+from jaxreg._core.programs_ahead import THREAD, WAITED
 from jaxreg._core.typing import Progress as ProgressCall
 from jaxreg.app.cli.options import Options, SearchOptions
 from jaxreg.io.errors import InputError
@@ -188,7 +190,8 @@ def _told_once(show: Callable[..., None]) -> Callable[..., None]:
 class Clock:
     """Seconds in which JAX made programs: traced, loaded and compiled them.
 
-    Tracing is what each start repeats, loading is from the folder of kept programs.
+    Tracing is what each start repeats, loading is from the folder of kept programs; of
+    those that are loaded ahead what they were waited for.
     """
 
     _EVENTS: ClassVar = {
@@ -196,6 +199,7 @@ class Clock:
         "/jax/core/compile/jaxpr_to_mlir_module_duration": "trace",
         "/jax/compilation_cache/cache_retrieval_time_sec": "load",
         "/jax/core/compile/backend_compile_duration": "compile",
+        WAITED: "load",
     }
 
     def __init__(self) -> None:
@@ -204,7 +208,7 @@ class Clock:
 
     def hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         """An event of JAX that has just ended."""
-        if event not in self._EVENTS:
+        if event not in self._EVENTS or threading.current_thread().name == THREAD:
             return
         kind, start = self._EVENTS[event], time.perf_counter() - duration_secs
         # What began within it is part of it.

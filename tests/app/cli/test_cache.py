@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import numpy as np
 import pytest
 
 import jaxreg
+from jaxreg._core import programs_ahead
+from jaxreg._core.programs_ahead import THREAD, _Loading
 from jaxreg.app.cli.runtime import Clock, keep_compiled_programs
 
 
@@ -102,6 +105,23 @@ def test_a_cache_that_cannot_be_made_is_done_without(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     keep_compiled_programs()
     assert used == {}
+
+
+def test_what_is_loaded_ahead_counts_as_long_as_it_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(programs_ahead, "has_room", lambda: True)
+    clock = Clock()
+    read = "/jax/compilation_cache/cache_retrieval_time_sec"
+    thread = threading.Thread(target=clock.hear, args=(read, 5.0), name=THREAD)
+    thread.start()
+    thread.join()
+    assert clock.seconds(since=-np.inf) == {}
+    loading = _Loading(["a"], lambda name: time.sleep(0.2) or name)
+    while not loading._begun:
+        time.sleep(0.01)
+    assert loading.take("a") == "a"
+    assert 0 < clock.seconds(since=-np.inf)["load"] < 1
 
 
 def test_programs_are_counted_once_by_how_they_were_made():
