@@ -77,27 +77,30 @@ def test_the_last_process_tells_what_follows(tmp_path: Path):
     assert sorted(load.loaded) == sorted([B, D])
 
 
-def test_loading_ends_where_another_program_is_asked_for(tmp_path: Path, monkeypatch):
+def _loading_the_second(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[ProgramsAhead, Loader]:
+    """One thread, which is held up by the second of four programs."""
     monkeypatch.setattr(programs_ahead, "_THREADS", 1)
     load = Loader()
-    _ran(tmp_path, [A, B, C, D], load)
+    _ran(folder, [A, B, C, D], load)
     load.may.clear()
-    ahead = ProgramsAhead(tmp_path, load)
+    ahead = ProgramsAhead(folder, load)
     ahead.ask(A)
+    load.begun.wait()
+    return ahead, load
+
+
+def test_loading_ends_where_another_program_is_asked_for(tmp_path: Path, monkeypatch):
+    ahead, load = _loading_the_second(tmp_path, monkeypatch)
     assert ahead.ask(E) is None
     load.may.set()
     _finished()
-    assert load.loaded in ([B], [])
+    assert load.loaded == [B]
 
 
 def test_what_has_not_begun_is_left_to_who_asks_for_it(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(programs_ahead, "_THREADS", 1)
-    load = Loader()
-    _ran(tmp_path, [A, B, C, D], load)
-    load.may.clear()
-    ahead = ProgramsAhead(tmp_path, load)
-    ahead.ask(A)
-    load.begun.wait()
+    ahead, load = _loading_the_second(tmp_path, monkeypatch)
     assert ahead.ask(C) is None
     load.may.set()
     _finished()

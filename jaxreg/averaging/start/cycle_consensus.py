@@ -45,8 +45,8 @@ _GROUP = 12
 # six of another 576 lose frames that few edges hold; after two, two do and three gain.
 # A gain is one of so much log likelihood: settled poses go on to gain thousandths. (Any
 # gain: half as many rounds again, and of 360 graphs one more is right. To end also
-# where edges agree but `log_ratio` is below 0, as with half of few edges wrong, takes
-# half of the time and loses four of them.)
+# where edges agree but `log_ratio` is below 0, as with half of few edges wrong, after
+# four rounds, takes half of the time and loses four of them.)
 _MEET = 0.25
 _STILL = 2
 _GAIN = 0.1
