@@ -23,8 +23,9 @@ import numpy as np
 
 import jaxreg as jr
 from jaxreg.features import Agreed, propose
-from jaxreg.particle.conclude import APART, Pair
+from jaxreg.particle.candidates import APART
 from jaxreg.particle.modes import distinct_modes
+from jaxreg.particle.pair import Pair
 from jaxreg.particle.state import Particles
 from jaxreg.registrar import Frames, GivenPair, prepare_pair
 

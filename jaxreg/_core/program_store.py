@@ -3,7 +3,6 @@
 import functools
 import platform
 import warnings
-from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.program_call import Call
 from jaxreg._core.program_files import Hole, digest, pickled, read, write
 from jaxreg._core.programs_ahead import ProgramsAhead
 
@@ -23,24 +23,37 @@ class Program(NamedTuple):
 
     run: Any  # what `jax.jit` makes
     skeleton: Any  # the answer with holes for arrays
-    platform: str
-    takes: list[jax.ShapeDtypeStruct]
+    exported: Any
+    kept: bool  # whether it was on disk
 
     @classmethod
-    def of(cls, exported: Any, skeleton: Any) -> "Program":
+    def of(cls, exported: Any, skeleton: Any, kept: bool) -> "Program":
         """From what a file has."""
-        takes = [
-            jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type)
-            for x in exported.in_avals
-        ]
-        run, (platform,) = jax.jit(exported.call), exported.platforms
-        return cls(run, skeleton, platform, takes)
+        return cls(jax.jit(exported.call), skeleton, exported, kept)
 
     def __call__(self, args: Any, kwargs: Any) -> Any:
         given = jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array))
         leaves = self.run(*given)
-        if self.platform == "cpu" and not any(map(_is_committed, given)):
+        if self.platform == "cpu" and not any(map(is_committed, given)):
             leaves = _uncommitted(leaves)
+        return self._filled(leaves)
+
+    @property
+    def platform(self) -> str:
+        """Of the only one that it is for."""
+        (platform,) = self.exported.platforms
+        return platform
+
+    def lowered(self) -> Any:
+        """What a thread can compile; `run` then finds it compiled."""
+        return self.run.lower(*map(_shape, self.exported.in_avals))
+
+    @property
+    def gives(self) -> Any:
+        """The answer with shapes for arrays."""
+        return self._filled([_shape(x) for x in self.exported.out_avals])
+
+    def _filled(self, leaves: list[Any]) -> Any:
         holes, rest = eqx.partition(self.skeleton, lambda x: isinstance(x, Hole))
         return eqx.combine(jax.tree.unflatten(jax.tree.structure(holes), leaves), rest)
 
@@ -55,65 +68,39 @@ class ProgramStore:
         self._wide = False
         self._told = False
 
-    def program(
-        self, function: Callable, platform: str, args: Any, kwargs: Any
-    ) -> Program | None:
+    def program(self, call: Call) -> Program | None:
         """The program of a call; None if it cannot be kept."""
-        arrays, static = eqx.partition((args, kwargs), eqx.is_array)
-        leaves, places = jax.tree.flatten(arrays)
-        settings = _settings(platform)
-        usual = all(_is_usual(x, platform) for x in leaves)
-        if settings is None or not usual:
-            return None
-        rest, others = jax.tree.flatten(static)
-        holes = tuple(map(_hole, leaves))
-        # With their types, as 1 is True.
-        typed = tuple((type(x), x) for x in rest)
-        key = (function, places, others, typed, holes, settings)
-        try:
-            if key in self._met:
-                return self._met[key]
-        except TypeError:  # something static has no hash
-            return None
-        asked = eqx.combine(jax.tree.unflatten(places, holes), static)
-        self._met[key] = self._made(function, asked, platform, args, kwargs, settings)
-        return self._met[key]
+        if call.key not in self._met:
+            self._met[call.key] = self._made(call)
+        return self._met[call.key]
 
-    def _made(
-        self,
-        function: Callable,
-        asked: Any,
-        platform: str,
-        args: Any,
-        kwargs: Any,
-        settings: tuple,
-    ) -> Program | None:
+    def _made(self, call: Call) -> Program | None:
         """From the folder, else traced and put there."""
-        who = function.__module__, function.__qualname__
+        who = call.function.__module__, call.function.__qualname__
         try:
-            name = digest(pickled((*who, asked)), *settings, *_code())
+            name = digest(pickled((*who, call.asked)), *call.settings, *_code())
         except Exception:  # noqa: BLE001  whatever the pickling of an object raises
             return None
         self._wide = jnp.result_type(float) == jnp.float64
         found = self._ahead.ask(name) or self._read(name)
         if found is not None:
             return found
-        made = _exported(function, platform, args, kwargs)
+        made = _exported(call)
         if made is None:
             return None
         self._write(self.folder / f"{name}.program", *made)
-        return Program.of(*made)
+        return Program.of(*made, kept=False)
 
     def _read(self, name: str) -> Program | None:
         found = read(self.folder / f"{name}.program")
-        return None if found is None else Program.of(*found)
+        return None if found is None else Program.of(*found, kept=True)
 
     def _compiled(self, name: str) -> Program | None:
         """From the folder, ready to run; in a thread, which has settings of its own."""
         program = self._read(name)
         if program is not None and program.platform == jax.default_backend():
             with jax.enable_x64(self._wide):
-                program.run.lower(*program.takes).compile()
+                program.lowered().compile()
         return program
 
     def _write(self, path: Path, exported: Any, skeleton: Any) -> None:
@@ -127,19 +114,11 @@ class ProgramStore:
             self._told = True
 
 
-def _hole(x: Any) -> Hole:
-    return Hole(tuple(x.shape), str(x.dtype), bool(getattr(x, "weak_type", False)))
+def _shape(aval: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
 
 
-def _is_usual(x: Any, platform: str) -> bool:
-    """Whether an array is known, and on one device of the platform."""
-    if not is_concrete(x):
-        return False
-    devices = x.devices() if isinstance(x, jax.Array) else ()
-    return len(devices) < 2 and {d.platform for d in devices} <= {platform}
-
-
-def _is_committed(x: Any) -> bool:
+def is_committed(x: Any) -> bool:
     return isinstance(x, jax.Array) and x.committed
 
 
@@ -169,20 +148,6 @@ def _kind_of_key(x: jax.Array) -> Any:
     return jax.random.key_impl(x) if is_key else None
 
 
-def _settings(platform: str) -> tuple[str, ...] | None:
-    """Of JAX, on which a program depends; None where programs are not to be kept."""
-    config: Any = jax.config  # its names are made as it runs
-    if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs:
-        return None
-    return (
-        str(jnp.result_type(float)),
-        str(config.jax_default_matmul_precision),
-        str(config.jax_default_prng_impl),
-        str(config.jax_threefry_partitionable),
-        platform,
-    )
-
-
 @functools.cache
 def _code() -> tuple[str, ...]:
     """Versions, and the code of this package itself, which may be a checkout."""
@@ -194,23 +159,22 @@ def _code() -> tuple[str, ...]:
     return code, platform.python_version(), *versions
 
 
-def _exported(
-    function: Callable, platform: str, args: Any, kwargs: Any
-) -> tuple[Any, Any] | None:
+def _exported(call: Call) -> tuple[Any, Any] | None:
     """The traced program and the skeleton of its answer; None if it cannot be kept."""
     from jax import export
 
-    arrays, static = eqx.partition((args, kwargs), eqx.is_array)
+    arrays, static = eqx.partition((call.args, call.kwargs), eqx.is_array)
     leaves, places = jax.tree.flatten(arrays)
     skeletons = []
 
     def flat(*leaves: Any) -> list[Any]:
         args, kwargs = eqx.combine(jax.tree.unflatten(places, leaves), static)
-        arrays, rest = eqx.partition(function(platform, args, kwargs), eqx.is_array)
+        answer = call.function(call.platform, args, kwargs)
+        arrays, rest = eqx.partition(answer, eqx.is_array)
         skeletons.append(eqx.combine(jax.tree.map(lambda _: Hole(), arrays), rest))
         return jax.tree.leaves(arrays)
 
-    flat.__name__ = function.__name__
+    flat.__name__ = call.function.__name__
     try:
         return export.export(jax.jit(flat))(*leaves), skeletons[-1]
     except Exception:  # noqa: BLE001  `filter_jit` then raises what a user did wrong

@@ -9,12 +9,13 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 
 from jaxreg._core.platforms import platform_of, traced_for
+from jaxreg._core.program_call import Call
 from jaxreg._core.program_room import make_room
 from jaxreg._core.program_store import ProgramStore
 
@@ -29,22 +30,62 @@ def kept_program(function: Callable[P, Out]) -> Callable[P, Out]:
     Those of calls from outside of transformations, with arrays of one device and with
     methods of this package: of other code a key cannot tell when it changes.
     """
-    traced = _as_it_is_traced(function)
-    plain = eqx.filter_jit(traced)
+    program = KeptProgram(function)
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> Out:
+        return program(*args, **kwargs)
+
+    return call
+
+
+class KeptProgram(Generic[P, Out]):
+    """What `kept_program` calls."""
+
+    def __init__(self, function: Callable[P, Out]):
+        self._traced = _as_it_is_traced(function)
+        self._plain: Any = eqx.filter_jit(self._traced)
+        self._begun: set[Any] = set()
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> Out:
         platform = platform_of(args, kwargs)
         if platform is not None:
             make_room()
         if _STORE is None or platform is None:
-            return plain(platform, args, kwargs)
-        program = _STORE.program(traced, platform, args, kwargs)
+            return self._plain(platform, args, kwargs)
+        call = Call.of(self._traced, platform, args, kwargs)
+        program = None if call is None else _STORE.program(call)
         if program is None:
-            return plain(platform, args, kwargs)
+            return self._plain(platform, args, kwargs)
         return program(args, kwargs)
 
-    return call
+    def begin(self, *args: P.args, **kwargs: P.kwargs) -> "Begun | None":
+        """Traces the program of a call; None if it was, or is kept, or cannot be."""
+        platform = platform_of(args, kwargs)
+        if platform is None:
+            return None
+        call = Call.of(self._traced, platform, args, kwargs)
+        if call is None or call.key in self._begun:
+            return None
+        self._begun.add(call.key)
+        program = None if _STORE is None else _STORE.program(call)
+        if program is not None:
+            return None if program.kept else Begun(program.lowered(), program.gives)
+        lowered = self._plain.lower(platform, args, kwargs)
+        gives = eqx.filter_eval_shape(self._plain, platform, args, kwargs)
+        return Begun(lowered, gives)
+
+
+class Begun(NamedTuple):
+    """A program that was traced, but not compiled.
+
+    Attributes:
+        lowered: to be compiled, in any thread; a call then finds it compiled.
+        gives: its answer, with shapes for arrays.
+    """
+
+    lowered: Any
+    gives: Any
 
 
 def keep_programs(folder: Path | None) -> None:

@@ -2,13 +2,13 @@
 
 import abc
 import dataclasses
-from typing import Any
+from typing import Any, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxreg._core.arrays import cast_floats
 from jaxreg._core.checks import (
@@ -29,7 +29,8 @@ from jaxreg.neighbours import (
     VoxelTable,
     check_index,
 )
-from jaxreg.particle.conclude import APART, conclude
+from jaxreg.particle.candidates import APART, Candidates, Found, LogPrior
+from jaxreg.particle.conclude import conclude
 from jaxreg.particle.energies import AbstractEnergy
 from jaxreg.particle.pair import Pair
 from jaxreg.particle.priors import (
@@ -39,13 +40,11 @@ from jaxreg.particle.priors import (
     UniformPrior,
 )
 from jaxreg.particle.proposals import propose_modes
-from jaxreg.particle.state import Particles
 from jaxreg.registrar import (
     AbstractIndexedRegistrar,
     Frames,
     GivenPair,
     RegistrationSolution,
-    SearchTrace,
     prepare_pair,
 )
 from jaxreg.robust import AbstractKernel
@@ -59,24 +58,6 @@ _FINE = 4
 # Poses are judged by so many points, whatever number finds them: the evidence was
 # learned on clouds thinned to as many, and so does not depend on `max_points`.
 _JUDGED = 4096
-
-
-class Found(eqx.Module):
-    """What a search ended with.
-
-    Attributes:
-        particles: measured poses, with energies and weights.
-        num_steps: int32, steps of the local optimiser along the path of one of them.
-        finished: whether they had come to rest.
-        sure: whether there is no need to look for other poses.
-        trace: of the steps of a filter.
-    """
-
-    particles: Particles
-    num_steps: Int[Array, ""]
-    finished: Bool[Array, ""]
-    sure: Bool[Array, ""]
-    trace: SearchTrace | None = None
 
 
 class AbstractSearch(AbstractIndexedRegistrar):
@@ -155,6 +136,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
         problem = Problem.of(ready.source, ready.target, index, ready.frames)
         return _some_points(check_key(key), problem, self.num_points)
 
+    @final
     def solve(
         self,
         source: PointCloud,
@@ -171,6 +153,7 @@ class AbstractSearch(AbstractIndexedRegistrar):
         kind = VoxelTable if self.index is None else self.index
         return kind.build(cloud.points, cloud.mask)
 
+    @final
     def solve_indexed(
         self,
         source: PointCloud,
@@ -180,27 +163,46 @@ class AbstractSearch(AbstractIndexedRegistrar):
         key: Key | None,
     ) -> RegistrationSolution:
         """`solve` with an index built before, for clouds that enter many pairs."""
-        # The search is not differentiated, its loops know no reverse mode; the answer
-        # is, by what its last steps depend on.
-        moving = cast_floats(self, source.points.dtype)
-        moving_pair = Pair.of(source, target, target_index)
-        self, pair, init = lax.stop_gradient((moving, moving_pair, init))
+        pair = Pair.of(source, target, target_index)
+        return self.concluded(pair, self.candidates(pair, init, key))
+
+    @final
+    def candidates(
+        self, pair: Pair, init: Motion | None, key: Key | None
+    ) -> Candidates:
+        """The first half of `solve`: poses that may be the answer.
+
+        Not differentiated: the search's loops know no reverse mode.
+        """
+        held = cast_floats(self, pair.source.points.dtype)
+        self, pair, init = lax.stop_gradient((held, pair, init))
         key_points, key_search = jax.random.split(check_key(key))
         few = _some_points(key_points, pair.problem, self.num_points)
         found = self.search(key_search, few, init)
-        solution = conclude(
-            moving_pair,
-            found.particles,
-            found.num_steps,
-            found.finished,
-            self._proposals(pair, found.sure, init),
-            None if self.prior is None else self.prior.log_density,
+        proposals = self._proposals(pair, found.sure, init)
+        return Candidates.of(found, self.num_modes, proposals, self._log_prior)
+
+    @final
+    def concluded(self, pair: Pair, candidates: Candidates) -> RegistrationSolution:
+        """The second half: the candidates refined and judged.
+
+        It has derivatives, by what its last steps depend on.
+        """
+        moving = cast_floats(self, pair.source.points.dtype)
+        held = lax.stop_gradient(moving)
+        return conclude(
+            pair,
+            candidates,
+            held._log_prior,
             kernel=moving.kernel,
-            num_modes=self.num_modes,
-            refine_steps=self.refine_steps,
-            min_log_evidence=self.min_log_evidence,
+            num_modes=held.num_modes,
+            refine_steps=held.refine_steps,
+            min_log_evidence=held.min_log_evidence,
         )
-        return dataclasses.replace(solution, trace=found.trace)
+
+    @property
+    def _log_prior(self) -> LogPrior | None:
+        return None if self.prior is None else self.prior.log_density
 
     def proposes(self, d: int) -> bool:
         """Whether local features are looked at where no guess is given."""

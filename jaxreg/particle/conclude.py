@@ -1,7 +1,6 @@
-"""From many measured poses to an answer: modes, refinement, evidence, status."""
+"""From poses that may be the answer to one: refinement, evidence, status."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -12,20 +11,18 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxreg._core import control
 from jaxreg._core.adjoint import refusing
 from jaxreg._core.status import Status
-from jaxreg._core.typing import Motion, Scalar
+from jaxreg._core.typing import Scalar
 from jaxreg.local import Curvature, Rest, at_rest
 from jaxreg.matching import NO_EVIDENCE, Evidence, Problem
+from jaxreg.particle.candidates import APART, Candidates, LogPrior
 from jaxreg.particle.last_digits import LastRest, last_digits
-from jaxreg.particle.modes import distinct_modes, first_within
+from jaxreg.particle.modes import first_within
 from jaxreg.particle.pair import ExactPair, Pair
 from jaxreg.particle.refine import followed, polished, polishing, refined
-from jaxreg.particle.state import Particles
 from jaxreg.registrar import Modes, RegistrationSolution
 from jaxreg.robust import AbstractKernel
 
 
-#: Poses nearer than this, in radians and radii, are one mode.
-APART = 0.3
 #: Log odds of the first mode against all others together, below which it is one of
 #: several: at these, with equal odds before, one answer in four would be wrong. (Judged
 #: with patches in place of firmness, of 276 pairs of views of a room 106 had evidence
@@ -35,8 +32,6 @@ LEAST_ODDS = 1.0
 _LEAST_SHARED = 1 / 7
 # Modes of so much less evidence than the first are not worth the last steps.
 _HOPELESS = 6.0
-# What is known beforehand may outweigh all evidence: no pose has more.
-_MOST_EVIDENCE = 10.0
 # Steps of the most accurate residual, where it is close already.
 _POLISH = 8
 
@@ -47,16 +42,9 @@ _UNREFINED = (
 )
 
 
-#: What is known of a pose beforehand, in the frames of the search.
-LogPrior = Callable[[Motion], Scalar]
-
-
 def conclude(
     pair: Pair,
-    particles: Particles,
-    num_steps: Int[Array, ""],
-    finished: Bool[Array, ""],
-    proposals: tuple[Float[Array, "r D D"], Bool[Array, " r"]] | None = None,
+    candidates: Candidates,
     log_prior: LogPrior | None = None,
     *,
     kernel: AbstractKernel,
@@ -68,24 +56,19 @@ def conclude(
 
     Args:
         pair: what was searched, with the derivatives that poses are to follow.
-        particles: measured and weighted poses.
-        num_steps: steps of the local optimiser that led to them.
-        finished: whether they had come to rest.
-        proposals: more poses to refine and judge, and which are in use; they count
-            where surfaces hold them and a seventh of the source is shared.
+        candidates: what may be the answer: the poses after the first `num_modes` of
+            them count where surfaces hold them and a seventh of the source is shared.
         log_prior: of a pose, added to its log evidence.
         kernel: of the refinement, likewise.
-        num_modes: distinct poses of the particles to refine and judge; of these and the
-            proposals the solution has as many.
+        num_modes: how many modes the solution has.
         refine_steps: steps on all points; the modes are then ordered by their
             evidence. Without, by energy: the answer is the particle of least energy.
         min_log_evidence: of less the status is LOW_OVERLAP.
     """
     refines, moving = refine_steps > 0, (pair, kernel)
     pair, kernel = lax.stop_gradient(moving)
-    poses = _candidates(particles, num_modes, proposals, log_prior)
     exact = pair.exact
-    found = _judged(pair, exact, kernel, poses, num_modes, refine_steps, log_prior)
+    found = _judged(pair, exact, kernel, candidates, num_modes, refine_steps, log_prior)
     mass = _weights(found.log_evidence, found.sound) if refines else found.mass
     enough = found.log_evidence[0] >= min_log_evidence
     T_modes, curvatures = _accurate(pair, exact, kernel, found, enough, refines)
@@ -95,7 +78,8 @@ def conclude(
         T_modes = refusing(T_modes, moving, _UNREFINED)
     evidence = found.evidence
     doubtful = ~found.holds[0] | (_log_odds(found.log_evidence) < LEAST_ODDS)
-    status = _status(found.sound[0], enough, doubtful, pair, finished | refines)
+    rested = candidates.finished | refines
+    status = _status(found.sound[0], enough, doubtful, pair, rested)
     best, curvature = jax.tree.map(lambda x: x[0], (evidence, curvatures))
     return RegistrationSolution(
         T_target_source=T_modes[0],
@@ -105,7 +89,7 @@ def conclude(
         num_inliers=best.num_inliers,
         overlap=best.overlap,
         log_evidence=found.log_evidence[0],
-        num_steps=(num_steps + refine_steps).astype(jnp.int32),
+        num_steps=(candidates.num_steps + refine_steps).astype(jnp.int32),
         H=curvature.H,
         b=curvature.b,
         error=curvature.error,
@@ -119,10 +103,11 @@ def conclude(
             found.log_evidence,
             curvatures.covariance,
         ),
+        trace=candidates.trace,
     )
 
 
-class _Candidates(NamedTuple):
+class _Judged(NamedTuple):
     """Poses that may be the answer, with their weights, judged; best first.
 
     Where surfaces hold none of them, as those of a sphere, no pose can be told from
@@ -143,36 +128,17 @@ class _Candidates(NamedTuple):
         return jnp.where(self.sound, told, NO_EVIDENCE)
 
 
-def _candidates(
-    particles: Particles,
-    num_modes: int,
-    proposals: tuple[Float[Array, "r D D"], Bool[Array, " r"]] | None,
-    log_prior: LogPrior | None,
-) -> tuple[Float[Array, "q D D"], Float[Array, " q"]]:
-    """Distinct poses of the particles and what is proposed beside, with weights."""
-    limit, last = jnp.asarray(APART, particles.energy.dtype), None
-    if log_prior is not None:
-        last = jax.vmap(log_prior)(particles.T_target_source) < -_MOST_EVIDENCE
-    rows, mass = distinct_modes(particles, num_modes, last, angle=limit, distance=limit)
-    T = particles.T_target_source[rows]
-    if proposals is None:
-        return T, mass
-    T_more, in_use = proposals
-    more = in_use.astype(mass.dtype)
-    return jnp.concatenate([T, T_more]), jnp.concatenate([mass, more])
-
-
 def _judged(
     pair: Pair,
     exact: ExactPair,
     kernel: AbstractKernel,
-    candidates: tuple[Float[Array, "q D D"], Float[Array, " q"]],
+    candidates: Candidates,
     num_modes: int,
     refine_steps: int,
     log_prior: LogPrior | None,
-) -> _Candidates:
+) -> _Judged:
     """The candidates refined, those of most evidence first; as many as modes."""
-    T, mass = candidates
+    T, mass = candidates.T, candidates.mass
     judged, spacing = pair.judged, pair.spacing
     widths = jnp.geomspace(
         2 * jnp.maximum(spacing, judged.spacing),
@@ -192,7 +158,7 @@ def _judged(
     holds = evidence.grip.holds
     first = jnp.arange(len(sound)) < num_modes
     sound = sound & (first | _convincing(evidence.overlap, holds))
-    found = _Candidates(T, mass, sound, evidence, holds)
+    found = _Judged(T, mass, sound, evidence, holds)
     order = jnp.arange(num_modes)
     if refine_steps:
         order = jnp.argsort(-found.log_evidence)[:num_modes]
@@ -207,7 +173,7 @@ def _accurate(
     pair: Pair,
     exact: ExactPair,
     kernel: AbstractKernel,
-    found: _Candidates,
+    found: _Judged,
     enough: Bool[Array, ""],
     refines: bool,
 ) -> tuple[Float[Array, "q D D"], Curvature]:

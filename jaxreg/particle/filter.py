@@ -36,7 +36,7 @@ from jaxreg._core.typing import Key, Motion
 from jaxreg.local import AbstractStep, GaussNewton
 from jaxreg.matching import LIKELY, AbstractResidual, PointToPlane, Problem
 from jaxreg.neighbours import IndexBuilder
-from jaxreg.particle.base import Found
+from jaxreg.particle.candidates import Found
 from jaxreg.particle.draw import SETTLE_STEPS, most_look_ups, with_settled
 from jaxreg.particle.dynamics import AbstractDynamics, StochasticDynamics
 from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy

@@ -14,7 +14,8 @@ from jaxreg._core.typing import Key, Motion
 from jaxreg.local import AbstractStep, GaussNewton, decoupled_error
 from jaxreg.matching import LIKELY, AbstractResidual, PointToPlane, Problem, match
 from jaxreg.neighbours import IndexBuilder
-from jaxreg.particle.base import AbstractSearch, Found
+from jaxreg.particle.base import AbstractSearch
+from jaxreg.particle.candidates import Found
 from jaxreg.particle.energies import AbstractEnergy, BoundedEnergy
 from jaxreg.particle.priors import AbstractPrior, GivenParticles
 from jaxreg.particle.state import Particles

@@ -16,6 +16,7 @@ from jaxreg.registrar import (
     AbstractRegistrar,
     GivenPair,
     Modes,
+    PreparedPair,
     RegistrationSolution,
     prepare_pair,
 )
@@ -33,9 +34,23 @@ def register_pair(
     key: Array | None,
 ) -> RegistrationSolution:
     """Of sources, targets, their masks and viewpoints; traced."""
-    ready = prepare_pair(method, pair)
-    init = None if init is None else ready.frames.enter(init)
+    ready, init = enter_pair(method, pair, init)
     solution = ready.method.solve(ready.source, ready.target, init, key)
+    return leave_pair(ready, solution)
+
+
+def enter_pair(
+    method: AbstractRegistrar, pair: GivenPair, init: Array | None
+) -> tuple[PreparedPair, Array | None]:
+    """Prepared, in frames of its own; so is the guess."""
+    ready = prepare_pair(method, pair)
+    return ready, None if init is None else ready.frames.enter(init)
+
+
+def leave_pair(
+    ready: PreparedPair, solution: RegistrationSolution
+) -> RegistrationSolution:
+    """What the method answers, in frames, units and statuses of what was given."""
     doubted = jnp.isin(solution.status, jnp.array(_DOUBTED))
     status = jnp.where(
         ready.unit_differs & doubted, Status.UNIT_DIFFERS, solution.status

@@ -17,27 +17,20 @@ from jaxreg._core.checks import (
     check_motion,
     check_pair,
     check_rigid,
-    is_concrete,
 )
 from jaxreg._core.log import log_solution
-from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import ArrayLike, Key, Progress
 from jaxreg.batching.devices import (
-    Devices,
     chosen_devices,
-    for_one,
-    map_rows,
-    spread_rows,
 )
 from jaxreg.batching.padding import (
     check_lists,
     is_list_of_clouds,
-    lengthened,
-    rounded_up,
 )
 from jaxreg.local import ICP
 from jaxreg.particle import AbstractSearch, ParticleFilter
 from jaxreg.registrar import AbstractRegistrar, GivenPair, RegistrationSolution
+from jaxreg.registration.alone import register_alone
 from jaxreg.registration.far import (
     check_prior_fits,
     moved_back,
@@ -45,7 +38,6 @@ from jaxreg.registration.far import (
     near_origin,
 )
 from jaxreg.registration.many import register_batch, register_lists
-from jaxreg.registration.pair import register_pair
 from jaxreg.registration.viewpoints import checked_viewpoints
 
 
@@ -227,9 +219,7 @@ def register(
     if batch:
         sol = register_batch(method, batch, pair, init, key, *how)
     else:
-        alone = for_one(devices)
-        given = spread_rows(alone, (_rounded_up(pair), init, key))
-        sol = _register_one(method, given, alone)
+        sol = register_alone(method, pair, init, key, devices)
     sol = moved_back(sol, here, there)
     log_solution("register", sol)
     return sol
@@ -251,32 +241,3 @@ def _check_init(
             f"init: wanted one motion or leading axes {batch} like source, found "
             f"shape {found.shape}."
         ) from err
-
-
-def _rounded_up(pair: GivenPair) -> GivenPair:
-    """With masked rows added to concrete arrays, so that few sizes compile.
-
-    Both get one size where these are next to each other: else pairs of scans of similar
-    sizes would be four programs.
-    """
-    clouds = pair[:4]
-    if not all(map(is_concrete, clouds)):
-        return pair
-    sizes = [rounded_up(len(x), an_octave=2) for x in clouds[:2]]
-    if max(sizes) <= 1.5 * min(sizes):
-        sizes = [max(sizes)] * 2
-    longer = (lengthened(x, num) for x, num in zip(clouds, 2 * sizes, strict=True))
-    return GivenPair(*longer, viewpoints=pair.viewpoints)
-
-
-# A pair; an initial pose; a key.
-_Given = tuple[GivenPair, Array | None, Array | None]
-
-
-@kept_program
-def _register_one(
-    method: AbstractRegistrar, given: _Given, devices: Devices | None
-) -> RegistrationSolution:
-    if devices is None:
-        return register_pair(method, *given)
-    return map_rows(devices, lambda given: register_pair(method, *given), given)

@@ -8,8 +8,8 @@ from jaxreg.matching import NO_EVIDENCE, Evidence
 from jaxreg.matching.slippage import Grip
 from jaxreg.particle.conclude import (
     LEAST_ODDS,
-    _Candidates,
     _convincing,
+    _Judged,
     _log_odds,
     _weights,
 )
@@ -79,7 +79,7 @@ def test_contact_is_what_is_told_where_surfaces_hold_no_pose(holds, told):
     evidence = Evidence(
         log_evidence, contact, zero, zero, zero, jnp.zeros(2, jnp.int32), grip
     )
-    found = _Candidates(
+    found = _Judged(
         jnp.tile(jnp.eye(4), (2, 1, 1)),
         zero,
         jnp.ones(2, bool),

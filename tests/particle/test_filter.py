@@ -40,6 +40,7 @@ from jaxreg.particle import (
     base,
     sandhu2010,
 )
+from jaxreg.particle.candidates import Candidates
 from jaxreg.particle.conclude import conclude
 from jaxreg.particle.draw import SETTLE_STEPS
 from jaxreg.particle.energies import AbstractEnergy
@@ -78,9 +79,7 @@ def _search(method, problem):
 def _conclude(pair, found):
     return conclude(
         pair,
-        found.particles,
-        found.num_steps,
-        found.finished,
+        Candidates.of(found, 2),
         kernel=L2(),
         num_modes=2,
         refine_steps=0,

@@ -22,7 +22,7 @@ from rich.progress import (
 )
 
 import jaxreg
-from jaxreg._core.programs_ahead import THREAD, WAITED
+from jaxreg._core import programs_ahead, programs_in_a_row
 from jaxreg._core.typing import Progress as ProgressCall
 from jaxreg.app.cli.options import Options, SearchOptions
 from jaxreg.io.errors import InputError
@@ -199,7 +199,8 @@ class Clock:
         "/jax/core/compile/jaxpr_to_mlir_module_duration": "trace",
         "/jax/compilation_cache/cache_retrieval_time_sec": "load",
         "/jax/core/compile/backend_compile_duration": "compile",
-        WAITED: "load",
+        programs_ahead.WAITED: "load",
+        programs_in_a_row.WAITED: "compile",
     }
 
     def __init__(self) -> None:
@@ -208,7 +209,8 @@ class Clock:
 
     def hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         """An event of JAX that has just ended."""
-        if event not in self._EVENTS or threading.current_thread().name == THREAD:
+        thread = threading.current_thread().name
+        if event not in self._EVENTS or thread == programs_ahead.THREAD:
             return
         kind, start = self._EVENTS[event], time.perf_counter() - duration_secs
         # What began within it is part of it.
