@@ -130,7 +130,7 @@ class Held(eqx.Module):
         for exact in (False, True):
             motions, log_odds = measured(scans, placed, least, pairs, exact=exact)
             of_nodes = _contracted(self, placed, motions)
-            nodes = place(of_nodes, self._num_nodes, *told, log_odds if exact else None)
+            nodes = place(of_nodes, self._num_nodes, *told, log_odds)
             placed = _expanded(self, scans.present, placed, nodes)
         return placed, AveragedPairs.of(motions, nodes, least)
 

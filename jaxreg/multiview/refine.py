@@ -74,15 +74,14 @@ def refine(
     moving, scans = scans, lax.stop_gradient(scans)
 
     def averaged(
-        motions: RelativeMotions, before: Placement, log_odds: Array | None = None
+        motions: RelativeMotions, before: Placement, log_odds: Array
     ) -> Placement:
         start = lax.stop_gradient(before.T_world_i) if starts else None
         told = averaging, least, scans.count, start, roughly(least), log_odds
         return place(motions, scans.num_scans, *told)
 
-    # What these poses say of parts is not asked: they may be a little off.
-    motions, _ = measured(scans, placement, least, pairs, exact=False)
-    placement = _updated(placement, averaged(motions, placement))
+    motions, log_odds = measured(scans, placement, least, pairs, exact=False)
+    placement = _updated(placement, averaged(motions, placement, log_odds))
     motions, log_odds = measured(scans, placement, least, pairs, exact=True)
     told = optimiser_of(motions.T_i_j), _last_width(moving, placement), least
     motions = follow_points(moving, motions, *told)
@@ -121,7 +120,8 @@ def measured(
     Returns:
         Of pairs of a part, m = 1; and the log odds that each pair's surfaces coincide
         at the poses, which others vouch for. They are 0 where surfaces hardly meet: of
-        noise alone some points are near each other by chance.
+        noise alone some points are near each other by chance. All are 1 if not `exact`:
+        poses that are a little off do not tell parts apart.
     """
 
     def run(block: Array) -> tuple[RelativeMotions, Array]:
@@ -160,6 +160,7 @@ def _measured(
     T_i_j = map_side_by_side(one, (pairs, told.log_evidence), scans.num_rows)
     each = T_i_j, told.overlap, told.log_evidence, told.inlier_rmse
     log_odds = jnp.where(told.fitness >= LIKELY, told.log_evidence + VOUCHED, 0)
+    log_odds = log_odds if exact else jnp.ones_like(log_odds)
     return RelativeMotions(pairs, *(x[:, None] for x in each)), log_odds
 
 

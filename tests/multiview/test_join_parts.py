@@ -96,6 +96,14 @@ def test_parts_join_where_most_speaks_for_it_of_either(told: list):
     np.testing.assert_array_equal(_LIKELIEST(*_arrays(told)), part)
 
 
+@given(_PAIRS)
+@settings(deadline=None)
+def test_where_every_pair_speaks_for_joining_what_is_confirmed_is_joined(told):
+    *arrays, odds = _arrays(told)
+    every = _LIKELIEST(*arrays, np.ones_like(odds))
+    np.testing.assert_array_equal(every, _CONFIRMED(*arrays))
+
+
 def test_pairs_that_agree_join_no_parts_of_which_others_say_they_meet_nowhere():
     """Two parts of three scans, and two pairs between them."""
     within = [(i, j) for i, j in combinations(range(6), 2) if (i < 3) == (j < 3)]
