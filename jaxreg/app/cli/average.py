@@ -257,8 +257,11 @@ def _show(
 def _show_residuals(session: Session, report: EdgeReport, ids: np.ndarray) -> None:
     """The adjustment as surveyors read it."""
     table = Table(title="Largest residuals")
-    for name in ("from", "to", "translation", "rotation (deg)", "normalised", "r"):
+    for name in ("from", "to", "translation", "rotation (deg)", "normalised"):
         table.add_column(name, justify="right")
+    known = not np.isnan(report.redundancy).any()  # of large graphs they are not
+    if known:
+        table.add_column("r", justify="right")
     for row in report.worst:
         i, j = report.edges[row]
         table.add_row(
@@ -269,7 +272,7 @@ def _show_residuals(session: Session, report: EdgeReport, ids: np.ndarray) -> No
             ),
             f"{np.rad2deg(report.rotation[row]):.4g}",
             f"{report.normalised[row]:.2f}",
-            f"{report.redundancy[row]:.2f}",
+            *([f"{report.redundancy[row]:.2f}"] if known else []),
         )
     session.console.print(table)
     if report.degrees_of_freedom > 0:
@@ -279,6 +282,5 @@ def _show_residuals(session: Session, report: EdgeReport, ids: np.ndarray) -> No
         )
     else:
         told = "No motion is to spare, so nothing checks the others."
-    session.console.print(
-        f"{told} Normalised: in standard deviations; r: redundancy number."
-    )
+    meaning = "; r: redundancy number." if known else "."
+    session.console.print(f"{told} Normalised: in standard deviations{meaning}")

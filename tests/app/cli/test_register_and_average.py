@@ -66,7 +66,9 @@ def test_the_largest_part_of_a_graph_is_placed(
     found = json.loads(Path("jaxreg-out/result.json").read_text())
     assert found["names"] == [1, 2, 0]
     assert found["T_world_i"][2] is None
-    np.testing.assert_allclose(np.array(found["T_world_i"][1])[:2, 2], [1, 0])
+    np.testing.assert_allclose(
+        np.array(found["T_world_i"][1])[:2, 2], [1, 0], atol=1e-12
+    )
 
 
 def test_a_position_is_that_of_the_origin_in_the_target(
@@ -319,6 +321,25 @@ def test_average_lowers_the_objective(folder: Path, capsys: pytest.CaptureFixtur
     assert found["names"] == [0, 1, 2]
     assert np.shape(found["T_world_i"]) == (3, 3, 3)
     assert "objective" in capsys.readouterr().out
+
+
+def test_average_tells_redundancy_numbers_where_there_are_any(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    Path("g.g2o").write_text(GRAPH)
+    assert main(["average", "g.g2o", "--method", "plain"]) == 0
+    assert "r: redundancy number." in " ".join(capsys.readouterr().out.split())
+
+    def of_many_frames(*given: Any, **rest: Any) -> Any:
+        return jaxreg.edge_report(*given, max_unknowns=1, **rest)
+
+    command = import_module("jaxreg.app.cli.average")
+    monkeypatch.setattr(command, "edge_report", of_many_frames)
+    assert main(["average", "g.g2o", "--method", "plain"]) == 0
+    told = capsys.readouterr().out
+    assert "Largest residuals" in told
+    assert "nan" not in told
+    assert "redundancy" not in told
 
 
 def test_average_goes_into_the_frame_of_what_is_known(
