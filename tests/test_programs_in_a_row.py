@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from jaxreg._core import programs_in_a_row
+from jaxreg._core.program_room import drop_programs
 from jaxreg._core.programs import keep_programs
 from jaxreg._core.programs_ahead import THREAD
 from jaxreg._core.programs_in_a_row import WAITED, kept_programs
@@ -88,6 +89,10 @@ def test_both_are_compiled_once_the_first_in_a_thread(told: Told):
     call(_numbers(4), "a")
     assert len(told.compiled) == 4
     assert call(x, "b")[2] == "b!"
+    drop_programs()
+    told.compiled.clear()
+    assert call(x, "a")[2] == "a!"
+    assert sorted(beside for _, beside in told.compiled) == [False, True]
 
 
 def test_what_is_kept_is_only_loaded(tmp_path: Path, told: Told):

@@ -15,6 +15,7 @@ import numpy as np
 import jaxreg as jr
 from bench.case import Case, Judged, Method, Options
 from bench.workloads.local_data import draw, load
+from jaxreg._core.program_room import drop_programs
 from jaxreg.averaging import Correntropy, average
 from jaxreg.datasets import sculpture_scans
 from jaxreg.graph import PoseGraph
@@ -50,7 +51,7 @@ def cases(options: Options) -> Iterator[Case]:
 
 
 def _first(call: Callable[[], Any]) -> None:
-    jax.clear_caches()
+    drop_programs()
     jax.block_until_ready(call())
 
 

@@ -20,9 +20,10 @@ _COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 class _Watch:
-    """Whether anything was compiled since maps were counted."""
+    """Whether anything was compiled since maps were counted; how often all went."""
 
     compiled = False
+    num_drops = 0
 
     @classmethod
     def hear(cls, event: str, duration_secs: float, **kwargs: str | int) -> None:
@@ -44,13 +45,24 @@ def make_room() -> None:
     _Watch.compiled = False
     used = share_used()
     if used > _MOST:
-        jax.clear_caches()
+        drop_programs()
         LOGGER.warning(
             "%.0f %% of the memory maps that a process may have were used by compiled "
             "programs: all were dropped, and are compiled again when needed. Clouds of "
             "few sizes, or lists of them, need fewer.",
             100 * used,
         )
+
+
+def drop_programs() -> None:
+    """Drops all compiled programs of the process."""
+    jax.clear_caches()
+    _Watch.num_drops += 1
+
+
+def num_drops() -> int:
+    """How often all programs were dropped; what was compiled before is no more."""
+    return _Watch.num_drops
 
 
 def has_room() -> bool:

@@ -16,7 +16,7 @@ import jax
 
 from jaxreg._core.platforms import platform_of, traced_for
 from jaxreg._core.program_call import Call
-from jaxreg._core.program_room import make_room
+from jaxreg._core.program_room import make_room, num_drops
 from jaxreg._core.program_store import ProgramStore
 
 
@@ -45,7 +45,8 @@ class KeptProgram(Generic[P, Out]):
     def __init__(self, function: Callable[P, Out]):
         self._traced = _as_it_is_traced(function)
         self._plain: Any = eqx.filter_jit(self._traced)
-        self._begun: set[Any] = set()
+        # Of each, how often all programs had been dropped by then.
+        self._begun: dict[Any, int] = {}
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> Out:
         platform = platform_of(args, kwargs)
@@ -65,9 +66,9 @@ class KeptProgram(Generic[P, Out]):
         if platform is None:
             return None
         call = Call.of(self._traced, platform, args, kwargs)
-        if call is None or call.key in self._begun:
+        if call is None or self._begun.get(call.key) == num_drops():
             return None
-        self._begun.add(call.key)
+        self._begun[call.key] = num_drops()
         program = None if _STORE is None else _STORE.program(call)
         if program is not None:
             return None if program.kept else Begun(program.lowered(), program.gives)
