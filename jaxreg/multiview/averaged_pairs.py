@@ -2,10 +2,10 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxreg._core.checks import is_concrete
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
 from jaxreg.multiview.place import Placement
@@ -42,8 +42,14 @@ class AveragedPairs(eqx.Module):
     def beside(self, other: "AveragedPairs") -> "AveragedPairs":
         """These and others, without padding; outside of `jit`."""
         every = jax.tree.map(lambda *x: np.concatenate(x), self, other)
-        real = every.pairs[:, 0] != every.pairs[:, 1]
-        return jax.tree.map(lambda x: jnp.asarray(x[real]), every)
+        return every.without_padding()
+
+    def without_padding(self) -> "AveragedPairs":
+        """Cut on the host; with it where values are not known."""
+        if not all(map(is_concrete, (self.pairs, self.weight))):
+            return self
+        real = np.asarray(self.pairs[:, 0] != self.pairs[:, 1])
+        return jax.device_put(jax.tree.map(lambda x: np.asarray(x)[real], self))
 
 
 @kept_program

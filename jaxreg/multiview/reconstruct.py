@@ -258,9 +258,10 @@ def _of_chosen_pairs(
         known = known.padded(prepared.num_scans)
     told = hold, known, rounds.overlaps
     solution = finish(method, averaging, prepared, motions_padded, *told)
+    averaged = solution.averaged.without_padding()
     if hold is not None and isinstance(previous, ReconstructionSolution):
-        both = previous.averaged.beside(solution.averaged)
-        solution = eqx.tree_at(lambda s: s.averaged, solution, both)
+        averaged = previous.averaged.beside(averaged)
+    solution = eqx.tree_at(lambda s: s.averaged, solution, averaged)
     solution = jax.block_until_ready(solution)
     report("averaging and refining", 1, 1)
     return solution.of_pairs(len(motions.overlap)).of_scans(prepared.num_present)

@@ -126,5 +126,12 @@ class ReconstructionSolution(eqx.Module):
 
 
 def _first(parts: tuple[object, ...], num: int) -> tuple[object, ...]:
-    """The first rows, cut on the host: there no program is compiled for each number."""
-    return jax.device_put(jax.tree.map(lambda x: np.asarray(x)[:num], parts))
+    """The first rows, cut on the host: there no program is compiled for each number.
+
+    But for those with derivatives.
+    """
+
+    def cut(x: jax.Array) -> jax.Array | np.ndarray:
+        return (np.asarray(x) if is_concrete(x) else x)[:num]
+
+    return jax.device_put(jax.tree.map(cut, parts))

@@ -194,6 +194,10 @@ def test_poses_follow_what_is_known(found):
     east = jnp.array([1.0, 0, 0])
     _, slopes = jax.jvp(places, (jnp.zeros(3),), (east,))
     np.testing.assert_allclose(slopes, np.tile(east, (8, 1)), atol=5e-3)
+    many = jax.vmap(places)(jnp.stack([0 * east, 0.1 * east]))
+    np.testing.assert_allclose(
+        many[1] - many[0], 0.1 * np.tile(east, (8, 1)), atol=1e-3
+    )
 
 
 def test_what_is_known_means_the_same_of_centred_scans():
