@@ -5,7 +5,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxreg._core.checks import is_concrete
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
 from jaxreg.multiview.place import Placement
@@ -45,9 +44,7 @@ class AveragedPairs(eqx.Module):
         return every.without_padding()
 
     def without_padding(self) -> "AveragedPairs":
-        """Cut on the host; with it where values are not known."""
-        if not all(map(is_concrete, (self.pairs, self.weight))):
-            return self
+        """Cut on the host; outside of `jit`."""
         real = np.asarray(self.pairs[:, 0] != self.pairs[:, 1])
         return jax.device_put(jax.tree.map(lambda x: np.asarray(x)[real], self))
 
