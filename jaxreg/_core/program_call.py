@@ -18,7 +18,6 @@ class Call(NamedTuple):
         function: of a platform, arguments and named ones.
         platform: of the device.
         args, kwargs: the arguments.
-        asked: these with holes for arrays.
         settings: those of JAX on which the program depends.
         key: equal for those that share a program, in this process.
     """
@@ -27,7 +26,6 @@ class Call(NamedTuple):
     platform: str
     args: Any
     kwargs: Any
-    asked: Any
     settings: tuple[str, ...]
     key: Any
 
@@ -51,8 +49,13 @@ class Call(NamedTuple):
             hash(key)
         except TypeError:  # something static has no hash
             return None
-        asked = eqx.combine(jax.tree.unflatten(places, holes), static)
-        return cls(function, platform, args, kwargs, asked, settings, key)
+        return cls(function, platform, args, kwargs, settings, key)
+
+    @property
+    def asked(self) -> Any:
+        """The arguments with holes for arrays."""
+        given = self.args, self.kwargs
+        return jax.tree.map(lambda x: _hole(x) if eqx.is_array(x) else x, given)
 
 
 def _hole(x: Any) -> Hole:

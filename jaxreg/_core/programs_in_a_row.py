@@ -1,8 +1,8 @@
 """Two programs, one after the other, which are compiled side by side.
 
-XLA compiles one program on little more than one core: `jaxreg register` took 25 to 29 s
-for 31 to 35 on two. Where they are kept, `ProgramsAhead` loads the second beside the
-first: 4.8 s for 6.4.
+XLA compiles one program on little more than one core: `jaxreg register` takes 25 s for
+33 on two. Where they are kept, `ProgramsAhead` loads the second beside the first: 4.8 s
+for 6.4.
 """
 
 import contextlib

@@ -20,13 +20,8 @@ from jaxreg._core.checks import (
 )
 from jaxreg._core.log import log_solution
 from jaxreg._core.typing import ArrayLike, Key, Progress
-from jaxreg.batching.devices import (
-    chosen_devices,
-)
-from jaxreg.batching.padding import (
-    check_lists,
-    is_list_of_clouds,
-)
+from jaxreg.batching.devices import chosen_devices
+from jaxreg.batching.padding import check_lists, is_list_of_clouds
 from jaxreg.local import ICP
 from jaxreg.particle import AbstractSearch, ParticleFilter
 from jaxreg.registrar import AbstractRegistrar, GivenPair, RegistrationSolution
