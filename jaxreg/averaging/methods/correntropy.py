@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxreg._core.arrays import traced
 from jaxreg._core.checks import check_counts, check_not_negative, check_parts
 from jaxreg._core.programs import kept_program
+from jaxreg._core.programs_in_a_row import kept_programs
 from jaxreg._core.typing import Key
 from jaxreg.averaging.base import AbstractAverager, AveragingSolution, starting_poses
 from jaxreg.averaging.likelihood import Likelihood
@@ -73,7 +74,7 @@ class Correntropy(AbstractAverager):
     ) -> AveragingSolution:
         """Averages a prepared graph."""
         if graph.num_poses > DENSE_LIMIT:
-            return self._large(graph, init, key)
+            return _average_large(self, graph, init, key)
         T_start = starting_poses(self.initialiser, graph, init, key)
         return self._small(graph, T_start)
 
@@ -87,22 +88,48 @@ class Correntropy(AbstractAverager):
         )
         return solution_of(graph, end, likelihood, evidence)
 
-    @kept_program
-    def _large(
-        self, graph: PoseGraph, init: Float[Array, "v D D"] | None, key: Key | None
-    ) -> AveragingSolution:
-        near = without_doubtful_closures(jax.lax.stop_gradient(graph))
-        likelihood = Likelihood.of(graph)
-        if init is None:
-            T_start = starting_poses(self.initialiser, near, None, key)
-            better = _better_start(likelihood, T_start, near)
-            starts = [better, along_frames(graph)]
-        else:
-            # A start of the caller's may be far off: plain steps that leave out what
-            # pulls against them would bend it for good.
-            starts = [_better_start(likelihood, init, graph)]
-        end = graduated(graph, likelihood, near, jnp.stack(starts), self.max_steps)
-        return solution_of(graph, end, likelihood)
+
+class _Started(eqx.Module):
+    """A large graph, and the poses that it descends from.
+
+    Attributes:
+        near: the graph with the weights of plain steps.
+        starts: poses; the likeliest of where they lead is kept.
+    """
+
+    method: Correntropy
+    graph: PoseGraph
+    likelihood: Likelihood
+    near: PoseGraph
+    starts: Float[Array, "m v D D"]
+
+
+def _start(
+    method: Correntropy,
+    graph: PoseGraph,
+    init: Float[Array, "v D D"] | None,
+    key: Key | None,
+) -> _Started:
+    near = without_doubtful_closures(jax.lax.stop_gradient(graph))
+    likelihood = Likelihood.of(graph)
+    if init is None:
+        T_start = starting_poses(method.initialiser, near, None, key)
+        better = _better_start(likelihood, T_start, near)
+        starts = [better, along_frames(graph)]
+    else:
+        # A start of the caller's may be far off: plain steps that leave out what
+        # pulls against them would bend it for good.
+        starts = [_better_start(likelihood, init, graph)]
+    return _Started(method, graph, likelihood, near, jnp.stack(starts))
+
+
+def _descend(given: _Started) -> AveragingSolution:
+    graph, likelihood = given.graph, given.likelihood
+    how = given.near, given.starts, given.method.max_steps
+    return solution_of(graph, graduated(graph, likelihood, *how), likelihood)
+
+
+_average_large = kept_programs(_start, _descend)
 
 
 def _better_start(
