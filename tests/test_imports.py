@@ -12,6 +12,8 @@ def test_commands_start_without_what_only_pictures_need(command: str):
     slow += ["plotly", "viser", "torch"]
     if command == "register":
         slow.append("jaxreg.averaging")
+    if command == "average":  # no scans are read, none searched for
+        slow += ["jaxreg.particle", "jaxreg.matching", "jaxreg.local"]
     code = f"""
 import sys
 import jaxreg.app.cli.{command}

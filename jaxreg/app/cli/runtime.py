@@ -69,7 +69,7 @@ def key_of(options: Options) -> jax.Array:
     return jax.random.key(options.seed)
 
 
-def method_of(options: SearchOptions) -> jaxreg.ParticleFilter:
+def method_of(options: SearchOptions) -> "jaxreg.ParticleFilter":
     """The search of that budget, knowing what is upright."""
     usual = jaxreg.ParticleFilter()
     least = 2 * usual.num_modes
