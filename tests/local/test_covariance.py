@@ -1,9 +1,10 @@
-"""What steps of Gauss-Newton leave of where they began."""
+"""Parts of the covariance of a pose: what steps leave, what patches decide alone."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxreg.local import covariance
 from jaxreg.local.held_directions import after_steps
 
 
@@ -30,3 +31,14 @@ def test_what_does_not_answer_is_led_nowhere():
     assert share[4, 4] < 0.08
     assert not gain[5].any()
     assert not share[5].any()
+
+
+def test_a_patch_that_decides_alone_counts_for_more_than_its_pull():
+    # Each patch is one cell that pulls along an axis that it alone holds, or all hold.
+    patches, k = 6, 6
+    pulls, patch, cell = jnp.eye(patches), jnp.arange(patches), jnp.arange(patches)
+    alone, all_alike = jnp.eye(k, patches), jnp.ones((k, patches))
+    for rows, left in (alone, 0.1), (all_alike, 1 - 1 / patches):
+        points = rows, jnp.ones(patches), cell
+        found = float(covariance._shared(pulls, patch, jnp.eye(k), points))
+        assert found == pytest.approx(patches / left, rel=1e-5)
