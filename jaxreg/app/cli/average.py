@@ -25,7 +25,7 @@ from jaxreg.app.cli.known import (
 from jaxreg.app.cli.options import Average
 from jaxreg.app.cli.runtime import Session, compile_in_a_hurry, key_of
 from jaxreg.app.folder import result_folder
-from jaxreg.app.plot import draw_graph, save_figure, write_graph_report
+from jaxreg.app.plot import draw_graph, write_graph_report
 from jaxreg.app.plot.chained import chained
 from jaxreg.app.plot.results import MAX_COVARIANCES
 from jaxreg.app.result import RESULT_FORMAT, write_json
@@ -134,15 +134,13 @@ def _write(
     told: tuple[KnownOfGraph, list[dict[str, Any]], dict[str, Any]],
 ) -> None:
     known, entries, by_hand = told
-    with result_folder(session.options.out) as staging:
+    poses = np.asarray(before.T_world_i), np.asarray(sol.T_world_i)
+    drawn = np.asarray(graph.edges), *poses, np.asarray(sol.placed)
+    with (
+        result_folder(session.options.out) as staging,
+        outputs.drawn_beside(session, staging / "figure.png", draw_graph, *drawn),
+    ):
         with session.timed("write"):
-            figure = draw_graph(
-                np.asarray(graph.edges),
-                np.asarray(before.T_world_i),
-                np.asarray(sol.T_world_i),
-                np.asarray(sol.placed),
-            )
-            save_figure(staging / "figure.png", figure)
             kept = writable(session, known, graph.dim)
             write_g2o(staging / "graph.g2o", graph, sol.T_world_i, ids, kept)
             placed = np.asarray(sol.placed)

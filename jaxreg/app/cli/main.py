@@ -19,13 +19,17 @@ import threading
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import find_spec
-from typing import NoReturn, get_args
+from types import ModuleType
+from typing import TYPE_CHECKING, NoReturn, get_args
 
 from jaxreg.app.folder import held
 from jaxreg.app.versions import version
 from jaxreg.io.errors import InputError, MissingExtraError
 from jaxreg.io.printable import printable
 
+
+if TYPE_CHECKING:
+    from jaxreg.app.cli.options import Options
 
 _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 _INTERRUPTED, _UNREAD = 130, 141
@@ -150,10 +154,17 @@ def _run(arguments: list[str]) -> int:
         args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
-    # What a command needs is imported when it is known which one it is.
-    module = import_module(f"jaxreg.app.cli.{type(command).__name__.lower()}")
     if not isinstance(command, Options):
-        return module.run(command)
+        return _module_of(command).run(command)
+    from jaxreg.app.plot.drawing import expecting_a_picture
+
+    with expecting_a_picture():
+        return _run_with_results(command, arguments)
+
+
+def _run_with_results(command: "Options", arguments: list[str]) -> int:
+    """A command that computes what it writes into a folder."""
+    module = _module_of(command)
     from jaxreg.app.cli import runtime
 
     runtime.keep_compiled_programs()
@@ -165,6 +176,11 @@ def _run(arguments: list[str]) -> int:
             text = (command.out / "result.json").read_text(encoding="utf-8")
             sys.stdout.write(text)
     return code
+
+
+def _module_of(command: object) -> ModuleType:
+    """What a command needs is imported when it is known which one it is."""
+    return import_module(f"jaxreg.app.cli.{type(command).__name__.lower()}")
 
 
 def _require_command(word: str, commands: list[str]) -> None:

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,9 @@ from jaxreg.app.cli.inputs import Scans, look_of
 from jaxreg.app.cli.options import ModelOptions, Register
 from jaxreg.app.cli.runtime import Session
 from jaxreg.app.folder import result_folder
-from jaxreg.app.plot import draw_reconstruction, save_figure, write_report
+from jaxreg.app.plot import write_report
+from jaxreg.app.plot.drawing import Drawing
+from jaxreg.app.plot.figure import draw_points, thinned
 from jaxreg.app.result import Result, result_document, write_result
 from jaxreg.io.errors import MissingExtraError
 from jaxreg.io.printable import printable
@@ -89,13 +91,13 @@ def write_files(
         The result, which knows the files of whole scans.
     """
     shown = result.to_show()
-    with result_folder(session.options.out) as staging:
+    with result_folder(session.options.out) as staging, contextlib.ExitStack() as drawn:
         if shown is not None:
             with session.timed("write"):
-                figure = draw_reconstruction(
-                    scans, shown.T_world_i, shown.names, shown.component
-                )
-                save_figure(staging / "figure.png", figure)
+                few = thinned(scans)
+            told = few, shown.T_world_i, list(shown.names), shown.component
+            file = staging / "figure.png"
+            drawn.enter_context(drawn_beside(session, file, draw_points, *told))
         look = None
         if isinstance(session.options, ModelOptions) and read is not None:
             with session.timed("write"):
@@ -125,6 +127,22 @@ def write_files(
                 details=page_details(session, document),
             )
     return result
+
+
+@contextlib.contextmanager
+def drawn_beside(
+    session: Session, path: Path, draw: Callable[..., Any], *args: Any
+) -> Iterator[None]:
+    """A picture, drawn while the block writes other files; see `Drawing`."""
+    with session.timed("write"):
+        drawing = Drawing(path, draw, *args)
+    try:
+        yield
+        with session.timed("write"):
+            drawing.finish()
+    except BaseException:
+        drawing.stop()
+        raise
 
 
 def _with_aligned(

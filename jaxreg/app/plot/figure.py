@@ -45,15 +45,29 @@ def draw_reconstruction(
     Raises:
         MissingExtraError: if matplotlib is not installed.
     """
-    component = np.zeros(len(scans), int) if component is None else component
-    component = np.asarray(component)
+    return draw_points(thinned(scans), T_world_i, names, component)
+
+
+def thinned(scans: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """What is drawn of scans: finite points, of very many some."""
     stride = 1 + sum(len(s) for s in scans) // _MAX_POINTS
-    before = [s[np.isfinite(s).all(axis=1)][::stride].astype(float) for s in scans]
+    return [s[np.isfinite(s).all(axis=1)][::stride].astype(float) for s in scans]
+
+
+def draw_points(
+    before: list[np.ndarray],
+    T_world_i: np.ndarray,
+    names: Sequence[str],
+    component: Sequence[int] | np.ndarray | None = None,
+) -> Any:
+    """`draw_reconstruction` of what `thinned` gives."""
+    component = np.zeros(len(before), int) if component is None else component
+    component = np.asarray(component)
     after = [
         x @ T[:-1, :-1].T + T[:-1, -1]
         for x, T in zip(before, np.asarray(T_world_i, float), strict=True)
     ]
-    colors = scan_colors(len(scans))
+    colors = scan_colors(len(before))
     solid = before[0].shape[1] == 3
     rows = min(int(component.max()) + 1, _MAX_MODELS)
     height = 3.9 * rows + 1
