@@ -9,9 +9,10 @@ from bench.records import Row
 from jaxreg.app.plot.figure import new_figure, save_figure
 
 
-#: What a command reports of its time, in order; the rest are imports, mostly.
+#: What a command reports of its time, in order. The rest are imports, mostly, and the
+#: picture and the page, which are done after it has reported.
 PARTS = ("read", "trace", "load", "compile", "run", "write")
-_REST = "import"
+REST = "rest: imports, page"
 
 
 def draw(rows: list[Row], path: Path, colors: Sequence[str]) -> Path | None:
@@ -25,7 +26,7 @@ def draw(rows: list[Row], path: Path, colors: Sequence[str]) -> Path | None:
         figsize=(9, 0.42 * len(rows) + 1.2), dpi=110, layout="constrained"
     )
     axis, left = figure.subplots(), np.zeros(len(rows))
-    for part, color in zip((_REST, *PARTS), colors, strict=False):
+    for part, color in zip((REST, *PARTS), colors, strict=False):
         here = np.array([s[part] for s in seconds])
         axis.barh(names, here, left=left, color=color, label=part)
         left += here
@@ -44,4 +45,4 @@ def bar(row: Row) -> dict[str, float]:
     """Seconds by part; the rest has what older rows leave out."""
     told = {part: row.value(part) or 0.0 for part in PARTS}
     wall = (row.value("wall_ms") or 0.0) / 1e3
-    return {_REST: max(wall - sum(told.values()), 0.0), **told}
+    return {REST: max(wall - sum(told.values()), 0.0), **told}
