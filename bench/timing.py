@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import json
-import os
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -82,13 +81,6 @@ def in_turn(
 def quartiles(values: list[float], scale: float = 1.0) -> list[float]:
     """Lower quartile, median and upper quartile."""
     return [float(scale * x) for x in np.percentile(values, (25, 50, 75))]
-
-
-def num_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def versions(*packages: str) -> dict[str, str]:

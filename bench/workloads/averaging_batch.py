@@ -14,9 +14,9 @@ import numpy as np
 from bench.case import Case, Judged, Method, Options
 from bench.peers.pose_graphs import SIGMAS, robust, robust_many
 from bench.records import error, share
-from bench.timing import num_cores
 from bench.workloads.averaging_data import H, N, batch_of, small_graph
 from bench.workloads.local_pairs import written_out
+from jaxreg._core.cores import num_cores
 from jaxreg.averaging import Correntropy, average
 from jaxreg.graph import PoseGraph
 from jaxreg.metrics import rotation_errors, translation_errors

@@ -10,9 +10,9 @@ import numpy as np
 
 from bench.case import Case, Method, Options
 from bench.peers.local_settings import peers, solve_many
-from bench.timing import num_cores
 from bench.workloads.local_data import accuracy, draw, load
 from bench.workloads.local_pairs import own_methods, pose_alone
+from jaxreg._core.cores import num_cores
 
 
 PAIRS, POINTS = 64, 2_000

@@ -3,7 +3,6 @@
 A pool of the standard library; JAX's own settings of a thread have to be carried.
 """
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -14,13 +13,6 @@ import jax.numpy as jnp
 
 _Item = TypeVar("_Item")
 _Out = TypeVar("_Out")
-
-
-def num_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def map_in_threads(

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxreg._core.checks import is_concrete
-from jaxreg.batching.threads import map_in_threads, num_cores
+from jaxreg._core.cores import num_cores
+from jaxreg.batching.threads import map_in_threads
 
 
 Tree = TypeVar("Tree")

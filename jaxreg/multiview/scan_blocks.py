@@ -13,12 +13,13 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxreg._core.cores import num_cores
 from jaxreg._core.platforms import platform_of
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Scalar
 from jaxreg.batching.padding import rounded_up
 from jaxreg.batching.side_by_side import map_side_by_side
-from jaxreg.batching.threads import map_in_threads, num_cores
+from jaxreg.batching.threads import map_in_threads
 from jaxreg.cloud import PointCloud
 from jaxreg.multiview.method import with_features
 from jaxreg.multiview.prepare import PreparedScan, prepare_scan

@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxreg._core.checks import is_concrete
+from jaxreg._core.cores import num_cores
 from jaxreg._core.platforms import platform_of
 from jaxreg._core.programs import kept_program
 from jaxreg._core.typing import Progress
@@ -22,7 +23,7 @@ from jaxreg.batching.padding import (
 )
 from jaxreg.batching.progress import tell
 from jaxreg.batching.side_by_side import side_by_side
-from jaxreg.batching.threads import map_in_threads, num_cores
+from jaxreg.batching.threads import map_in_threads
 from jaxreg.registrar import AbstractRegistrar, GivenPair, RegistrationSolution
 from jaxreg.registration.pair import register_pair
 

@@ -1,6 +1,6 @@
 """Pictures drawn by a process of their own, which has imported what that needs by then.
 
-Matplotlib takes as long to import as to draw, 0.3 s each, and keeps Python's lock: in a
+Matplotlib takes 0.3 s to import and up to 0.7 to draw, and keeps Python's lock: in a
 thread nothing is gained. Where there is no such process, or it fails, the picture is
 drawn in this one.
 """
@@ -12,6 +12,8 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+from jaxreg._core.cores import num_cores
 
 
 # Found where this process finds it; nothing of the folder that it runs in.
@@ -31,9 +33,10 @@ class _Waiting:
 def expecting_a_picture() -> Iterator[None]:
     """A process waits during the block to draw one.
 
-    Not if this one has imported Matplotlib already, or cannot start another.
+    Not where this one has imported Matplotlib already, or cannot start another, nor on
+    one core: there a start takes 0.4 s more by it.
     """
-    if "matplotlib.figure" not in sys.modules:
+    if num_cores() > 1 and "matplotlib.figure" not in sys.modules:
         with contextlib.suppress(OSError):
             _Waiting.process = subprocess.Popen(
                 [sys.executable or "python", "-P", "-c", _RUN],
@@ -63,9 +66,9 @@ class Drawing:
         self._asked = path, draw, args
         self._process, _Waiting.process = _Waiting.process, None
         if self._process is not None and self._process.stdin is not None:
-            with contextlib.suppress(OSError):  # it has ended: see `finish`
-                pickle.dump(self._asked, self._process.stdin)
-                self._process.stdin.close()
+            # Where it has ended: see `finish`.
+            with contextlib.suppress(OSError), self._process.stdin as told:
+                pickle.dump(self._asked, told)
 
     def finish(self) -> None:
         """Waits until the file is there.

@@ -23,6 +23,7 @@ def process(monkeypatch: pytest.MonkeyPatch):
     expecting = expecting_a_picture()
     with monkeypatch.context() as hidden:
         hidden.delitem(sys.modules, "matplotlib.figure", raising=False)
+        hidden.setattr(drawing, "num_cores", lambda: 2)
         expecting.__enter__()
     found = drawing._Waiting.process
     assert found is not None
@@ -33,6 +34,10 @@ def process(monkeypatch: pytest.MonkeyPatch):
 
 def test_none_is_started_where_it_would_gain_nothing(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", sys)
+    with expecting_a_picture():
+        assert drawing._Waiting.process is None
+    monkeypatch.delitem(sys.modules, "matplotlib.figure")
+    monkeypatch.setattr(drawing, "num_cores", lambda: 1)
     with expecting_a_picture():
         assert drawing._Waiting.process is None
 
@@ -64,12 +69,18 @@ def test_what_the_process_cannot_do_is_done_here(
     assert (tmp_path / "figure.png").stat().st_size > 0
 
 
+@pytest.mark.parametrize("num", [3, 10_000])  # less and more than a pipe holds
 def test_a_process_that_has_died_is_not_needed(
-    tmp_path: Path, process: subprocess.Popen[bytes]
+    tmp_path: Path, process: subprocess.Popen[bytes], num: int
 ):
     process.kill()
     process.wait()
-    Drawing(tmp_path / "figure.png", draw_graph, *TOLD).finish()
+    poses = np.resize(POSES, (num, 4, 4))
+    told = EDGES, poses, poses, np.ones(num, bool)
+    one = Drawing(tmp_path / "figure.png", draw_graph, *told)
+    assert process.stdin is not None
+    assert process.stdin.closed
+    one.finish()
     assert (tmp_path / "figure.png").stat().st_size > 0
 
 
@@ -94,7 +105,9 @@ def test_files_of_the_folder_are_not_run(
     code = (
         "import sys; sys.path.pop(0)\n"
         "from pathlib import Path\n"
+        "from jaxreg.app.plot import drawing\n"
         "from jaxreg.app.plot.drawing import Drawing, _Waiting, expecting_a_picture\n"
+        "drawing.num_cores = lambda: 2\n"
         "with expecting_a_picture():\n"
         "    process = _Waiting.process\n"
         "    one = Drawing(Path('figure.png'), print)\n"
